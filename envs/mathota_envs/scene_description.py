@@ -1,0 +1,128 @@
+"""What there is to draw: the shapes of a model as plain NumPy data, with their colours and extents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+PALETTE = (
+    (0.25, 0.53, 0.80),
+    (0.93, 0.53, 0.22),
+    (0.31, 0.66, 0.41),
+    (0.82, 0.33, 0.31),
+    (0.57, 0.44, 0.77),
+    (0.87, 0.69, 0.24),
+    (0.30, 0.71, 0.75),
+    (0.80, 0.45, 0.66),
+)
+"""Colours (sRGB, 0 to 1) of the bodies, in the order in which they first own a bounded shape."""
+
+PLANE_COLOUR = (0.62, 0.64, 0.67)
+
+BOUNDING_RADIUS = {
+    "sphere": lambda size: size["radius"],
+    "box": lambda size: sum(extent * extent for extent in size["half_extents"]) ** 0.5,
+    "capsule": lambda size: size["radius"] + size["half_height"],
+    "plane": lambda size: math.inf,
+}
+"""Radius [m] about the body origin that encloses a shape, by kind; for floats as for traced arrays."""
+
+
+def body_colours(shapes: Iterable[Any]) -> dict[int, tuple[float, float, float]]:
+    """Colour of every body that owns a bounded shape, from the entries of ``model.scene.shapes``."""
+    bodies = dict.fromkeys(shape.body for shape in shapes if shape.kind != "plane")
+    return {body: PALETTE[order % len(PALETTE)] for order, body in enumerate(bodies)}
+
+
+def scene_description(model: Any) -> list[dict[str, Any]]:
+    """Lists the shapes of a model in drawing order.
+
+    Args:
+        model: Anything with ``scene.shapes`` (entries with ``kind``, ``body``, ``index``) and ``shapes`` (arrays of
+            sizes by kind). The arrays must be concrete.
+
+    Returns:
+        One dictionary a shape: ``kind``, ``body``, ``colour`` (sRGB, 0 to 1), ``bounding_radius`` [m] (infinite for a
+        plane) and the sizes of its kind [m], such as ``radius`` or ``half_extents``, as floats or lists of floats.
+
+    Raises:
+        ValueError: A shape is of a kind that cannot be drawn.
+    """
+    colours = body_colours(model.scene.shapes)
+    description = []
+    for shape in model.scene.shapes:
+        if shape.kind not in BOUNDING_RADIUS:
+            raise ValueError(
+                f"shape kind {shape.kind!r} of body {shape.body} cannot be drawn: "
+                f"known kinds are {', '.join(sorted(BOUNDING_RADIUS))}"
+            )
+        sizes = model.shapes[shape.kind]
+        size = {name: np.asarray(values, dtype=float)[shape.index].tolist() for name, values in sizes.items()}
+        description.append(
+            {
+                "kind": shape.kind,
+                "body": int(shape.body),
+                "colour": PLANE_COLOUR if shape.kind == "plane" else colours[shape.body],
+                "bounding_radius": BOUNDING_RADIUS[shape.kind](size),
+                **size,
+            }
+        )
+    return description
+
+
+def foreground(description: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Shapes that a view should frame: the bounded ones, less those far larger than the rest (a floor made of a box)."""
+    bounded = [shape for shape in description if math.isfinite(shape["bounding_radius"])]
+    if not bounded:
+        return []
+    radii = sorted(shape["bounding_radius"] for shape in bounded)
+    typical = radii[(len(radii) - 1) // 2]
+    return [shape for shape in bounded if shape["bounding_radius"] <= 8.0 * typical]
+
+
+def bounding_sphere(description: list[dict[str, Any]], position: np.ndarray) -> tuple[np.ndarray, float]:
+    """Ball that holds the foreground of a scene over one or more frames.
+
+    Args:
+        description: From `scene_description`.
+        position: Body positions [m], ``(..., body, 3)``; frames with non-finite entries are ignored.
+
+    Returns:
+        Centre ``(3,)`` and radius [m]. A scene of planes only gets the unit ball at the foot of its first plane. Of
+        many frames the outermost 2 % are ignored, so one body that flies off does not shrink all others to a dot.
+    """
+    position = np.asarray(position, dtype=float)
+    frames = position.reshape(-1, *position.shape[-2:])
+    tracks = []
+    for shape in foreground(description):
+        track = frames[:, shape["body"]]
+        track = track[np.isfinite(track).all(axis=-1)]
+        if len(track):
+            tracks.append((track, shape["bounding_radius"]))
+    if not tracks:
+        planes = [shape for shape in description if shape["kind"] == "plane"]
+        foot = np.asarray(planes[0]["normal"]) * planes[0]["offset"] if planes else np.zeros(3)
+        return foot, 1.0
+    lowest = np.min([np.quantile(track, 0.02, axis=0, method="higher") - radius for track, radius in tracks], axis=0)
+    highest = np.max([np.quantile(track, 0.98, axis=0, method="lower") + radius for track, radius in tracks], axis=0)
+    centre = 0.5 * (lowest + highest)
+    reach = [
+        np.quantile(np.linalg.norm(track - centre, axis=-1), 0.98, method="lower") + radius for track, radius in tracks
+    ]
+    return centre, float(max(reach))
+
+
+def grid_cell(bounding_radius: Any) -> Array:
+    """Edge [m] of the ground's squares: the power of two nearest to twice the diameter of the smallest shape.
+
+    Args:
+        bounding_radius: Radii [m] of the shapes of a scene, ``(shape,)``; infinite ones (planes) do not count.
+    """
+    smallest = jnp.min(jnp.asarray(bounding_radius), initial=jnp.inf)
+    smallest = jnp.where(jnp.isfinite(smallest), smallest, 0.25)
+    return 2.0 ** jnp.round(jnp.log2(4.0 * smallest))

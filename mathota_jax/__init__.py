@@ -1,0 +1,49 @@
+"""mathota_jax: a differentiable rigid-body contact engine in JAX. This module is the whole public API."""
+
+from mathota_jax.builder import SceneBuilder
+from mathota_jax.constraints.joints.hinge import Hinge
+from mathota_jax.constraints.joints.slider import Slider
+from mathota_jax.diagnostics import (
+    Contacts,
+    angular_momentum,
+    contact_forces,
+    contacts,
+    energy,
+    joint_position,
+    joint_velocity,
+    momentum,
+)
+from mathota_jax.geometry import Box, Capsule, Plane, Sphere
+from mathota_jax.model import Model
+from mathota_jax.options import Options
+from mathota_jax.scene import Scene
+from mathota_jax.state import Flag, State, apply_force
+from mathota_jax.step import rollout, step
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Box",
+    "Capsule",
+    "Contacts",
+    "Flag",
+    "Hinge",
+    "Model",
+    "Options",
+    "Plane",
+    "Scene",
+    "SceneBuilder",
+    "Slider",
+    "Sphere",
+    "State",
+    "angular_momentum",
+    "apply_force",
+    "contact_forces",
+    "contacts",
+    "energy",
+    "joint_position",
+    "joint_velocity",
+    "momentum",
+    "rollout",
+    "step",
+]

@@ -1,0 +1,263 @@
+"""`batch_last`: functions that run with the world axis last, however JAX maps or differentiates them.
+
+XLA on CPUs vectorises over the minor axis of an array and a GPU coalesces along it. `jax.vmap` puts the mapped axis where
+the user had it, in front, so that natural ``(..., 3)`` code vectorises over nothing. `batch_last(function)` therefore
+takes a function written for arrays with one *trailing* world axis and turns it into one over arrays without it, whose
+
+* batching rule moves the mapped axis to the end and calls the same function again (nested maps add further axes, which
+  are merged before the call; unmapped arguments get a trailing axis of size 1, never a copy);
+* JVP is a second primitive, linear in the tangents, with the primal *inputs* as its only residuals (so reverse mode
+  stores one set of inputs per call and recomputes the rest);
+* transpose calls the VJP of the function, in the same layout.
+
+Both primitives carry any function, so the rules close over themselves: derivatives of any order, in any order with
+`vmap`, `scan`, `checkpoint` and `jit`. `jax.custom_batching.custom_vmap` cannot serve: its `vmap(grad)` fails.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+Native = Callable[..., list[Array]]
+"""Flat function of arrays with one trailing world axis each (of common size, or 1), hashable."""
+
+
+def batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Makes a natural-shaped function of a worlds-last one.
+
+    Args:
+      function: pure function of pytrees. Every array it receives has its natural axes followed by ONE world axis, whose
+        size is the number of worlds or 1 (argument shared by all worlds); every array it returns likewise.
+
+    Returns:
+      Function of the same pytrees without the world axis. Differentiable wherever `function` is; `jax.vmap` of it runs
+      `function` natively. Outside `jit` each call is compiled and cached by the structure of its arguments.
+    """
+
+    @functools.wraps(function)
+    def natural(*args: Any) -> Any:
+        leaves, in_tree = jax.tree.flatten(args)
+        leaves = [jnp.asarray(leaf) for leaf in leaves]
+        native = TreeFunction(function, in_tree)
+        out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
+        return jax.tree.unflatten(_out_tree(native, tuple(_signature(leaf) for leaf in leaves)), out_leaves)
+
+    return natural
+
+
+@dataclasses.dataclass(frozen=True)
+class TreeFunction:
+    """Flat native form of a function of pytrees."""
+
+    function: Callable[..., Any]
+    in_tree: Any
+
+    def __call__(self, *leaves: Array) -> list[Array]:
+        return jax.tree.leaves(self.function(*jax.tree.unflatten(self.in_tree, leaves)))
+
+    def out_tree(self, shapes: Sequence[jax.ShapeDtypeStruct]) -> Any:
+        """Structure of the result for arguments of the given shapes."""
+        result = jax.eval_shape(lambda *leaves: self.function(*jax.tree.unflatten(self.in_tree, leaves)), *shapes)
+        return jax.tree.structure(result)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pushforward:
+    """Tangents of the real outputs of `native`; arguments: all its inputs, then the tangents of those in `mask`."""
+
+    native: Native
+    mask: tuple[bool, ...]
+
+    def __call__(self, *args: Array) -> list[Array]:
+        primals, tangents = list(args[: len(self.mask)]), list(args[len(self.mask) :])
+        linear = [primal for primal, selected in zip(primals, self.mask, strict=True) if selected]
+        pairs = [jnp.broadcast_arrays(primal, tangent) for primal, tangent in zip(linear, tangents, strict=True)]
+        restricted = _restricted(self.native, primals, self.mask)
+        return list(jax.jvp(restricted, [pair[0] for pair in pairs], [pair[1] for pair in pairs])[1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Pullback:
+    """Cotangents, for each world, of the inputs in `mask`; arguments: all inputs, then those of the real outputs."""
+
+    native: Native
+    mask: tuple[bool, ...]
+
+    def __call__(self, *args: Array) -> list[Array]:
+        primals, cotangents = list(args[: len(self.mask)]), args[len(self.mask) :]
+        world_count = max(arg.shape[-1] for arg in args)
+        # A shared argument gets a cotangent in each world; whoever shares it does the sum.
+        linear = [
+            jnp.broadcast_to(primal, (*primal.shape[:-1], world_count))
+            for primal, selected in zip(primals, self.mask, strict=True)
+            if selected
+        ]
+        restricted = _restricted(self.native, primals, self.mask)
+        outputs, pull = jax.vjp(restricted, *linear)
+        return list(pull([jnp.broadcast_to(c, o.shape) for c, o in zip(cotangents, outputs, strict=True)]))
+
+
+def _restricted(native: Native, primals: list[Array], mask: tuple[bool, ...]) -> Callable[..., list[Array]]:
+    """The real outputs of `native` as a function of the inputs in `mask`."""
+
+    def function(*linear: Array) -> list[Array]:
+        replacements = iter(linear)
+        args = [next(replacements) if selected else primal for primal, selected in zip(primals, mask, strict=True)]
+        return [output for output in _traced(native)(*args) if _is_real(output)]
+
+    return function
+
+
+def _is_real(value: Any) -> bool:
+    return jnp.issubdtype(value.dtype, jnp.inexact)
+
+
+@functools.lru_cache(maxsize=512)
+def _traced(native: Native) -> Callable[..., list[Array]]:
+    """`native` behind `jit`, for its cache of traces only: shape inference, lowering and derivatives share one trace."""
+    return jax.jit(lambda *args: native(*args))
+
+
+def _evaluate(*args: Array, native: Native, world_axes: int) -> list[Array]:
+    """Calls `native` on arrays with any number of trailing world axes, merging them into one."""
+    worlds = np.broadcast_shapes(*(arg.shape[arg.ndim - world_axes :] for arg in args)) if world_axes else ()
+    outputs = _traced(native)(*(_merge_worlds(arg, worlds) for arg in args))
+    shapes = (output.shape[:-1] for output in outputs)
+    return [
+        jnp.broadcast_to(output, (*shape, math.prod(worlds))).reshape(*shape, *worlds)
+        for output, shape in zip(outputs, shapes, strict=True)
+    ]
+
+
+def _merge_worlds(arg: Array, worlds: tuple[int, ...]) -> Array:
+    natural = arg.shape[: arg.ndim - len(worlds)]
+    if math.prod(arg.shape[arg.ndim - len(worlds) :]) == 1:
+        return arg.reshape(*natural, 1)
+    return jnp.broadcast_to(arg, (*natural, *worlds)).reshape(*natural, math.prod(worlds))
+
+
+Signature = tuple[tuple[int, ...], Any]
+
+
+def _signature(value: Any) -> Signature:
+    return value.shape, value.dtype
+
+
+def _one_world(signatures: tuple[Signature, ...]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct((*shape, 1), dtype) for shape, dtype in signatures]
+
+
+@functools.lru_cache(maxsize=1024)
+def _out_tree(native: TreeFunction, signatures: tuple[Signature, ...]) -> Any:
+    return native.out_tree(_one_world(signatures))
+
+
+@functools.lru_cache(maxsize=1024)
+def _natural_outputs(native: Native, signatures: tuple[Signature, ...]) -> tuple[Signature, ...]:
+    outputs = jax.eval_shape(_traced(native), *_one_world(signatures))
+    return tuple((output.shape[:-1], output.dtype) for output in outputs)
+
+
+def _abstract_evaluation(*avals: Any, native: Native, world_axes: int) -> list[Any]:
+    worlds = np.broadcast_shapes(*(a.shape[a.ndim - world_axes :] for a in avals)) if world_axes else ()
+    signatures = tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in avals)
+    return [jax.core.ShapedArray((*shape, *worlds), dtype) for shape, dtype in _natural_outputs(native, signatures)]
+
+
+@functools.lru_cache(maxsize=512)
+def _compiled(native: Native, world_axes: int) -> Callable[..., list[Array]]:
+    return jax.jit(functools.partial(_evaluate, native=native, world_axes=world_axes))
+
+
+def _implementation(*args: Array, native: Native, world_axes: int) -> list[Array]:
+    return _compiled(native, world_axes)(*args)
+
+
+def _batching_rule(
+    primitive: Primitive, args: Sequence[Array], axes: Sequence[int | None], *, world_axes: int, **params: Any
+) -> tuple[list[Array], list[int]]:
+    moved = [
+        jnp.expand_dims(arg, arg.ndim) if axis is None else jnp.moveaxis(arg, axis, -1)
+        for arg, axis in zip(args, axes, strict=True)
+    ]
+    outputs = primitive.bind(*moved, world_axes=world_axes + 1, **params)
+    return outputs, [output.ndim - 1 for output in outputs]
+
+
+def _jvp_rule(
+    primals: Sequence[Array], tangents: Sequence[Any], *, native: Native, world_axes: int
+) -> tuple[list[Array], list[Any]]:
+    outputs = _call_p.bind(*primals, native=native, world_axes=world_axes)
+    mask = tuple(type(tangent) is not ad.Zero and _is_real(primal) for primal, tangent in zip(primals, tangents, strict=True))
+    selected = [tangent for tangent, wanted in zip(tangents, mask, strict=True) if wanted]
+    zeros = [ad.Zero(jax.typeof(output).to_tangent_aval()) for output in outputs]
+    if not selected:
+        return outputs, zeros
+    real = iter(_linear_p.bind(*primals, *selected, native=native, mask=mask, world_axes=world_axes))
+    return outputs, [next(real) if _is_real(output) else zero for output, zero in zip(outputs, zeros, strict=True)]
+
+
+def _linear_evaluate(*args: Array, native: Native, mask: tuple[bool, ...], world_axes: int) -> list[Array]:
+    return _evaluate(*args, native=Pushforward(native, mask), world_axes=world_axes)
+
+
+def _linear_implementation(*args: Array, native: Native, mask: tuple[bool, ...], world_axes: int) -> list[Array]:
+    return _implementation(*args, native=Pushforward(native, mask), world_axes=world_axes)
+
+
+def _linear_abstract_evaluation(*avals: Any, native: Native, mask: tuple[bool, ...], world_axes: int) -> list[Any]:
+    return _abstract_evaluation(*avals, native=Pushforward(native, mask), world_axes=world_axes)
+
+
+def _linear_jvp_rule(
+    args: Sequence[Array], tangents: Sequence[Any], *, native: Native, mask: tuple[bool, ...], world_axes: int
+) -> tuple[list[Array], list[Any]]:
+    return _jvp_rule(args, tangents, native=Pushforward(native, mask), world_axes=world_axes)
+
+
+def _linear_transpose_rule(
+    cotangents: Sequence[Any], *args: Any, native: Native, mask: tuple[bool, ...], world_axes: int
+) -> list[Any]:
+    primals, linear = args[: len(mask)], args[len(mask) :]
+    instantiated = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
+    pulled = _call_p.bind(*primals, *instantiated, native=Pullback(native, mask), world_axes=world_axes)
+    results = [
+        _sum_to(cotangent, argument.aval.shape) if ad.is_undefined_primal(argument) else None
+        for cotangent, argument in zip(pulled, linear, strict=True)
+    ]
+    return [None] * len(mask) + results
+
+
+def _sum_to(value: Array, shape: tuple[int, ...]) -> Array:
+    """Sums over the world axes along which the argument was shared."""
+    axes = tuple(axis for axis, (have, want) in enumerate(zip(value.shape, shape, strict=True)) if have != want)
+    return value.sum(axes, keepdims=True) if axes else value
+
+
+_call_p = Primitive("batch_last")
+_call_p.multiple_results = True
+_call_p.def_impl(_implementation)
+_call_p.def_abstract_eval(_abstract_evaluation)
+batching.primitive_batchers[_call_p] = functools.partial(_batching_rule, _call_p)
+ad.primitive_jvps[_call_p] = _jvp_rule
+mlir.register_lowering(_call_p, mlir.lower_fun(_evaluate, multiple_results=True))
+
+_linear_p = Primitive("batch_last_linear")
+_linear_p.multiple_results = True
+_linear_p.def_impl(_linear_implementation)
+_linear_p.def_abstract_eval(_linear_abstract_evaluation)
+batching.primitive_batchers[_linear_p] = functools.partial(_batching_rule, _linear_p)
+ad.primitive_jvps[_linear_p] = _linear_jvp_rule
+ad.primitive_transposes[_linear_p] = _linear_transpose_rule
+mlir.register_lowering(_linear_p, mlir.lower_fun(_linear_evaluate, multiple_results=True))

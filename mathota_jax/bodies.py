@@ -1,0 +1,88 @@
+"""The bodies of a scene in the form the engine computes with: components apart, worlds last."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.vector import Mat3, Vec3, multiply
+from mathota_jax.state import State
+
+
+class Inertia(NamedTuple):
+    """Mass properties of bodies; `rotation` is None where all bodies are spherical."""
+
+    inverse_mass: Array
+    moments: Vec3
+    rotation: Mat3 | None
+
+    def apply(self, angular_velocity: Vec3) -> Vec3:
+        """Angular momentum of an angular velocity, world frame."""
+        if self.rotation is None:
+            return multiply(self.moments, angular_velocity)
+        return self.rotation.apply(multiply(self.moments, self.rotation.apply_transposed(angular_velocity)))
+
+    def solve(self, torque: Vec3) -> Vec3:
+        """Inverse inertia times a vector, world frame."""
+        if self.rotation is None:
+            return Vec3(torque.x / self.moments.x, torque.y / self.moments.y, torque.z / self.moments.z)
+        local = self.rotation.apply_transposed(torque)
+        local = Vec3(local.x / self.moments.x, local.y / self.moments.y, local.z / self.moments.z)
+        return self.rotation.apply(local)
+
+
+class Bodies(NamedTuple):
+    """All bodies, static ones included; components of shape (body, world)."""
+
+    position: Vec3
+    orientation: Quaternion
+    velocity: Vec3
+    angular_velocity: Vec3
+
+
+def vector(array: Array) -> Vec3:
+    """Components of an (element, 3, world) array."""
+    return Vec3(array[:, 0], array[:, 1], array[:, 2])
+
+
+def quaternion(array: Array) -> Quaternion:
+    """Components of an (element, 4, world) array."""
+    return Quaternion(array[:, 0], array[:, 1], array[:, 2], array[:, 3])
+
+
+def unpack(state: State) -> Bodies:
+    """Bodies of a worlds-last state."""
+    return Bodies(
+        vector(state.position), quaternion(state.orientation), vector(state.velocity), vector(state.angular_velocity)
+    )
+
+
+def moving(scene: Scene, bodies: Bodies) -> Bodies:
+    """The bodies that are not static, in order: the velocity blocks of the solver."""
+    return take(bodies, scene.dynamic_bodies)
+
+
+def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inertia:
+    """Mass properties of the moving bodies at the given orientations."""
+    mass, moments = take((model.mass, vector(model.inertia)), scene.dynamic_bodies)
+    spherical = all(scene.spherical[body] for body in scene.dynamic_bodies)
+    return Inertia(1.0 / mass, moments, None if spherical else to_matrix(orientation))
+
+
+def pack_blocks(linear: Vec3, angular: Vec3 | None) -> Array:
+    """(component, block, world) array of generalized velocities; `angular` is None where nothing couples to rotation."""
+    components = tuple(linear) if angular is None else (*linear, *angular)
+    shape = jnp.broadcast_shapes(*(component.shape for component in components))
+    return jnp.stack([jnp.broadcast_to(component, shape) for component in components])
+
+
+def unpack_blocks(velocity: Array) -> tuple[Vec3, Vec3 | None]:
+    """Linear and angular part of blocks."""
+    linear = Vec3(velocity[0], velocity[1], velocity[2])
+    return linear, Vec3(velocity[3], velocity[4], velocity[5]) if velocity.shape[0] == 6 else None

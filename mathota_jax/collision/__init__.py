@@ -1,0 +1,1 @@
+"""Finding contacts: which features of two shapes are closest, and how far apart they are."""

@@ -1,0 +1,82 @@
+"""Closest-point helpers shared by the analytic pairs; worlds last, finite with finite derivatives everywhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.collision.manifold import ContactPoint, Manifold
+from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.vector import Vec3, dot, tangent_basis, where
+
+
+def direction(difference: Vec3, fallback: Vec3, size: Any) -> Vec3:
+    """Unit vector along `difference`, or the unit `fallback` where its length is round-off against `size`.
+
+    The dot product of the result with `difference` is the length, with the right derivative on both branches.
+    """
+    squared = dot(difference, difference)
+    tiny = (16.0 * jnp.finfo(squared.dtype).eps * size) ** 2
+    usable = settle((squared > tiny).astype(squared.dtype)) > 0.5
+    inverse = jnp.where(usable, 1.0 / jnp.sqrt(jnp.where(usable, squared, 1.0)), 0.0)
+    return where(usable, difference * inverse, fallback)
+
+
+def perpendicular(axis: Vec3) -> Vec3:
+    """Some unit vector perpendicular to the unit vector `axis`."""
+    return tangent_basis(axis)[0]
+
+
+def round_manifold(a: Vec3, b: Vec3, radius_a: Any, radius_b: Any, fallback: Vec3) -> Manifold:
+    """Single contact of two spheres around the closest core points `a` and `b` (guide 6.5)."""
+    difference = b - a
+    normal = direction(difference, fallback, radius_a + radius_b)
+    return Manifold(normal, (round_point(a, b, normal, radius_a, radius_b),))
+
+
+def round_point(
+    a: Vec3, b: Vec3, normal: Vec3, radius_a: Any, radius_b: Any, feature: Array | None = None, active: Any = True
+) -> ContactPoint:
+    """Contact of two core points inflated by their radii, measured along a given unit `normal`."""
+    separation = dot(normal, b - a) - radius_a - radius_b
+    middle = (a + b + normal * (radius_a - radius_b)) * 0.5
+    zero = jnp.zeros_like(separation, dtype=jnp.int32)
+    return ContactPoint(
+        position=middle,
+        separation=separation,
+        feature=zero if feature is None else feature + zero,
+        active=jnp.broadcast_to(active, jnp.shape(separation)),
+    )
+
+
+def closest_on_segment(point: Vec3, center: Vec3, axis: Vec3, half_length: Any) -> Vec3:
+    """Point of the segment ``center + t * axis``, ``|t| <= half_length`` (unit axis), that is closest to `point`."""
+    return center + axis * jnp.clip(dot(axis, point - center), -half_length, half_length)
+
+
+def closest_parameters(
+    offset: Vec3, axis_a: Vec3, axis_b: Vec3, half_length_a: Any, half_length_b: Any
+) -> tuple[Array, Array]:
+    """Parameters of the closest points of two segments with unit axes; `offset` leads from A's centre to B's.
+
+    Source: C. Ericson, "Real-Time Collision Detection" (2005), section 5.1.9. The determinant is taken from the
+    rejected component rather than as ``1 - cos^2``, which cancels; parallel axes start from the overlap's middle.
+    """
+    cosine = dot(axis_a, axis_b)
+    along_a = dot(axis_a, offset)
+    along_b = dot(axis_b, offset)
+    across = axis_b - axis_a * cosine
+    sine_squared = dot(across, across)
+    parallel = settle((sine_squared < 64.0 * jnp.finfo(sine_squared.dtype).eps).astype(sine_squared.dtype)) > 0.5
+    # The unconstrained minimum: offset + b * axis_b - a * axis_a is perpendicular to both axes.
+    line_a = (along_a - cosine * along_b) / jnp.where(parallel, 1.0, sine_squared)
+    # (Nearly) parallel: the middle of the overlap of B's shadow on A.
+    reach = half_length_b * jnp.abs(cosine)
+    low = jnp.clip(along_a - reach, -half_length_a, half_length_a)
+    high = jnp.clip(along_a + reach, -half_length_a, half_length_a)
+    a = jnp.where(parallel, 0.5 * (low + high), jnp.clip(line_a, -half_length_a, half_length_a))
+    b = jnp.clip(cosine * a - along_b, -half_length_b, half_length_b)
+    a = jnp.clip(cosine * b + along_a, -half_length_a, half_length_a)
+    return a, b

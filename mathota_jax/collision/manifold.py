@@ -1,0 +1,32 @@
+"""The result of a narrow-phase test (guide 7.1, with the normal from A to B)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jax import Array
+
+from mathota_jax.spatial.vector import Vec3
+
+
+class ContactPoint(NamedTuple):
+    """One point of a manifold; every component has shape ``(pair, world)``.
+
+    Attributes:
+        position: World point [m] midway between the two surface points.
+        separation: Signed gap [m] along the normal, negative when overlapping; always finite.
+        feature: int32 id of the geometric feature, stable from step to step within a pair.
+        active: bool, False where this slot holds no contact (its other fields are finite and meaningless).
+    """
+
+    position: Vec3
+    separation: Array
+    feature: Array
+    active: Array
+
+
+class Manifold(NamedTuple):
+    """Contact points of a pair that share one unit `normal` from A to B, in the world frame."""
+
+    normal: Vec3
+    points: tuple[ContactPoint, ...]

@@ -1,0 +1,101 @@
+"""Contacts of a scene: one vectorised test for each group of admissible pairs."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.collision.manifold import Manifold
+from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.scene import PairGroup, Scene
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.pose import Pose
+from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.vector import Vec3
+
+UNROTATED_KINDS = ("plane", "sphere")
+"""Kinds whose contacts do not depend on the orientation of the body (planes are given in the world frame)."""
+
+
+class ContactSet(NamedTuple):
+    """All contact slots of a scene, components of shape (slot, world); slots are numbered group, pair, point."""
+
+    position: Vec3
+    normal: Vec3
+    separation: Array
+    feature: Array
+    active: Array
+
+
+def find_contacts(
+    scene: Scene, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
+) -> ContactSet:
+    """Runs the narrow phase (guide 11.1, phases 2 and 3).
+
+    Args:
+      scene: static structure.
+      shapes: kind -> parameter -> (shape, ..., world).
+      position, orientation: of all bodies, components (body, world).
+    """
+    groups = [_group_contacts(group, shapes, position, orientation) for group in scene.pair_groups]
+    if len(groups) == 1:
+        return groups[0]
+    worlds = max(group.separation.shape[1] for group in groups)
+    return ContactSet(*(_concatenate(list(fields), worlds) for fields in zip(*groups, strict=True)))  # type: ignore[arg-type]
+
+
+def _concatenate(values: list[Any], worlds: int) -> Any:
+    if isinstance(values[0], Vec3):
+        return Vec3(*(_concatenate(list(components), worlds) for components in zip(*values, strict=True)))
+    return jnp.concatenate([jnp.broadcast_to(value, (value.shape[0], worlds)) for value in values])
+
+
+def _group_contacts(
+    group: PairGroup, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
+) -> ContactSet:
+    def pose(kind: str, bodies: tuple[int, ...]) -> Pose:
+        rotation = None if kind in UNROTATED_KINDS else to_matrix(take(orientation, bodies))
+        return Pose(take(position, bodies), rotation)
+
+    def parameters(kind: str, rows: tuple[int, ...]) -> dict[str, Any]:
+        return {
+            name: Vec3(values[:, 0], values[:, 1], values[:, 2]) if values.ndim == 3 else values
+            for name, values in take(shapes[kind], rows).items()
+        }
+
+    manifold = PAIRS[group.kind_a, group.kind_b].function(
+        parameters(group.kind_a, group.shapes_a),
+        pose(group.kind_a, group.bodies_a),
+        parameters(group.kind_b, group.shapes_b),
+        pose(group.kind_b, group.bodies_b),
+    )
+    return _flatten(manifold, len(group.bodies_a))
+
+
+def _flatten(manifold: Manifold, pair_count: int) -> ContactSet:
+    """Slots in the order pair, point."""
+    points = manifold.points
+    worlds = max(point.separation.shape[1] for point in points)
+    shape = (pair_count, worlds)
+
+    def per_point(values: list[Array]) -> Array:
+        full = [jnp.broadcast_to(value, shape) for value in values]
+        if len(full) == 1:
+            return full[0]
+        return jnp.stack(full, axis=1).reshape(pair_count * len(full), worlds)
+
+    def per_pair(value: Array) -> Array:
+        # A normal that all worlds share (that of a plane) keeps its single world.
+        full = jnp.broadcast_to(value[:, None], (pair_count, len(points), value.shape[-1]))
+        return full.reshape(pair_count * len(points), value.shape[-1])
+
+    position = Vec3(*(per_point([point.position[axis] for point in points]) for axis in range(3)))
+    return ContactSet(
+        position,
+        manifold.normal.map(per_pair),
+        per_point([point.separation for point in points]),
+        per_point([point.feature for point in points]),
+        per_point([point.active for point in points]),
+    )

@@ -1,0 +1,1 @@
+"""Rows: what contacts and joints hand to the solver."""

@@ -1,0 +1,71 @@
+"""Assembly of rows for the solver from directions and lever arms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.bodies import Inertia
+from mathota_jax.solver.table import EMPTY, Table
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.settle import compute_once, opaque_one
+from mathota_jax.spatial.vector import Vec3, dot
+
+
+class Side(NamedTuple):
+    """Part of a row's Jacobian (or response) on one body; `angular` is None where nothing couples to rotation."""
+
+    linear: Vec3
+    angular: Vec3 | None
+
+
+def respond(side: Side, inertia: Inertia) -> Side:
+    """``M^-1 J^T`` for the Jacobian of one row; `inertia` holds the body of each column."""
+    angular = None if side.angular is None else inertia.solve(side.angular)
+    return Side(side.linear * inertia.inverse_mass, angular)
+
+
+def inner(left: Side, right: Side) -> Array:
+    """Product of a Jacobian with a response or a velocity on the same body."""
+    total = dot(left.linear, right.linear)
+    return total if left.angular is None or right.angular is None else total + dot(left.angular, right.angular)
+
+
+def select(table: Table, tree: Any) -> Any:
+    """Slots of a table, in its order, from arrays with a leading slot axis. Padding repeats slot 0."""
+    return take(tree, np.maximum(table.order, 0))
+
+
+def select_blocks(table: Table, side: int, tree: Any) -> Any:
+    """Velocity blocks of one side of a table, in its order, from arrays with a leading block axis."""
+    blocks = np.asarray(table.blocks[side], np.int32).reshape(-1)
+    return take(tree, np.minimum(blocks, table.block_count - 1))
+
+
+def collect(tables: Sequence[Table], values: Sequence[Array], slot_count: int) -> Array:
+    """Slot order (slot, world) from the (turn, column, world) values of all tables."""
+    slots = np.concatenate([table.order for table in tables])
+    flat = jnp.concatenate([value.reshape(-1, value.shape[-1]) for value in values]) if len(values) > 1 else values[0]
+    positions = np.zeros(slot_count, np.int32)
+    positions[slots[slots != EMPTY]] = np.flatnonzero(slots != EMPTY)
+    return take(flat.reshape(-1, flat.shape[-1]), positions)
+
+
+def pack_sides(table: Table, rows: Sequence[Side], worlds: int) -> Array:
+    """(turn, row, component, column, world) from one `Side` for each row, components (turn * column, world)."""
+    components = [tuple(row.linear) if row.angular is None else (*row.linear, *row.angular) for row in rows]
+    return jnp.stack([pack_scalars(table, row, worlds) for row in components], axis=1)
+
+
+def pack_scalars(table: Table, values: Sequence[Array], worlds: int) -> Array:
+    """(turn, row, column, world) from one (turn * column, world) array for each row; padding becomes 0."""
+    turns, columns = table.turn_count, len(table.slots[0])
+    stored = [value if jnp.ndim(value) < 2 else compute_once(value, opaque_one(value, value.dtype)) for value in values]
+    full = [jnp.broadcast_to(value, (turns * columns, worlds)) for value in stored]
+    if EMPTY in table.order:
+        full = [jnp.where(table.order[:, None] == EMPTY, 0.0, value) for value in full]
+    return jnp.stack([value.reshape(turns, columns, worlds) for value in full], axis=1)

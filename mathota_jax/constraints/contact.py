@@ -1,0 +1,295 @@
+"""Contact rows: non-penetration, restitution at the time of impact, isotropic friction (guide 8 and 9).
+
+A row acts on the velocities at the *end* of the step, while the position moves by
+``dt (v_start + v_free) / 2 + lever * M^-1 J^T impulse``: the impulse of a contact that lasts the whole step acts, on
+average, at half time (lever dt/2), that of an impact at its time of impact (lever dt - tau). So a sliding block keeps its
+exact parabola and a bounce at tau is followed by the rest of the step in flight, whose derivative is the saltation matrix.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.constraints.assembly import Side, collect, inner, pack_scalars, pack_sides, respond, select, select_blocks
+from mathota_jax.bodies import Inertia
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.solver.laws import Bounded, Cone
+from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.table import Constraint, Table, make_tables
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
+
+
+class Motion(NamedTuple):
+    """Moving bodies at the start of a step: positions, and velocities now and at its end if nothing constrained them."""
+
+    position: Vec3
+    velocity: Side
+    free_velocity: Side
+    inertia: Inertia
+    gravity: Vec3
+
+
+class ContactRows(NamedTuple):
+    """Rows of one table with what else the step needs to know of its contacts.
+
+    Attributes:
+      rows: for the velocity solver.
+      lever: (turn, row, column, world) time [s] that an impulse has to act on the position.
+      directions: row directions in the world frame, components (turn * column, world).
+      separation: (turn, 1, column, world) at the start of the step.
+      slop: (turn, 1, column, world) penetration left alone.
+    """
+
+    rows: Rows
+    lever: Array
+    directions: tuple[Vec3, ...]
+    separation: Array
+    slop: Array
+
+
+def contact_tables(scene: Scene) -> tuple[Table, ...]:
+    """Order in which the solver visits the contact slots."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    constraints, slot = [], 0
+    for group in scene.pair_groups:
+        for a, b in zip(group.bodies_a, group.bodies_b, strict=True):
+            blocks = tuple(block_of[body] for body in (a, b) if body in block_of)
+            constraints.append(Constraint(blocks, tuple(range(slot, slot + group.point_count))))
+            slot += group.point_count
+    return make_tables(constraints, len(block_of))
+
+
+def couples_rotation(scene: Scene) -> bool:
+    """Whether any row exerts a torque: not if the scene has only frictionless contacts between spheres and planes."""
+    kinds = {kind for group in scene.pair_groups for kind in (group.kind_a, group.kind_b)}
+    return scene.friction or bool(scene.joints) or not kinds <= {"plane", "sphere"}
+
+
+def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet, motion: Motion) -> ContactRows:
+    """Rows of the contacts in one table."""
+    chosen: ContactSet = select(table, contacts)
+    worlds = max(chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1])
+    normal = chosen.normal
+    directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
+    rotating = couples_rotation(scene)
+    jacobians, responses, start, free = [], [], jnp.zeros(()), jnp.zeros(())
+    for side, sign in enumerate(_signs(scene, table)):
+        inertia = select_blocks(table, side, motion.inertia)
+        arm = chosen.position - select_blocks(table, side, motion.position)
+        jacobian = [
+            Side(direction * sign, cross(arm, direction) * sign if rotating else None) for direction in directions
+        ]
+        jacobians.append(jacobian)
+        responses.append([respond(row, inertia) for row in jacobian])
+        start = start + inner(jacobian[0], select_blocks(table, side, motion.velocity))
+        free = free + inner(jacobian[0], select_blocks(table, side, motion.free_velocity))
+
+    def delassus(row: int, column: int) -> Array:
+        return sum((inner(j[row], r[column]) for j, r in zip(jacobians, responses, strict=True)), jnp.zeros(()))
+
+    target, lever = _impact(scene, table, model, chosen, motion, start, free)
+    active = chosen.active.astype(normal.x.dtype)
+    normal_mass = active / delassus(0, 0)
+    bias = [-target]
+    if scene.friction:
+        half_sum, half_difference = (delassus(1, 1) + delassus(2, 2)) / 2, (delassus(1, 1) - delassus(2, 2)) / 2
+        coupling = delassus(1, 2)
+        largest = half_sum + safe_sqrt(half_difference * half_difference + coupling * coupling)
+        law = Cone(
+            normal_mass=pack_scalars(table, [normal_mass], worlds)[:, 0],
+            tangent_mass=pack_scalars(table, [active / largest], worlds)[:, 0],
+            coupling=pack_scalars(table, [delassus(1, 0), delassus(2, 0)], worlds),
+            friction=pack_scalars(table, [_pair_friction(scene, table, model)], worlds)[:, 0],
+        )
+        bias += [jnp.zeros(()), jnp.zeros(())]
+    else:
+        law = _push_only(pack_scalars(table, [normal_mass], worlds))
+    rows = Rows(
+        jacobian=tuple(pack_sides(table, jacobian, worlds) for jacobian in jacobians),
+        response=tuple(pack_sides(table, response, worlds) for response in responses),
+        bias=pack_scalars(table, bias, worlds),
+        law=law,
+        table=table,
+    )
+    slop = scene.options.slop * _smallest_size(scene, table, model)
+    separation = jnp.where(chosen.active, chosen.separation, 0.0)
+    return ContactRows(
+        rows,
+        pack_scalars(table, [lever], worlds),
+        directions,
+        pack_scalars(table, [separation], worlds),
+        pack_scalars(table, [slop], worlds),
+    )
+
+
+def _push_only(effective_mass: Array) -> Bounded:
+    zero = jnp.zeros((1,) * effective_mass.ndim, effective_mass.dtype)
+    shape = (effective_mass.shape[0], 1, 1, 1)
+    return Bounded(
+        effective_mass,
+        jnp.broadcast_to(zero, shape),
+        jnp.broadcast_to(zero, shape),
+        jnp.broadcast_to(zero + jnp.inf, shape),
+    )
+
+
+def _impact(
+    scene: Scene, table: Table, model: Model, contacts: ContactSet, motion: Motion, start: Array, free: Array
+) -> tuple[Array, Array]:
+    """Normal velocity to reach at the end of the step, and the lever of the impulse.
+
+    `start` and `free` are the normal velocities at the start and, unconstrained, at the end of the step. A contact *hits*
+    if it overlaps or if its present velocity closes the gap within the step; other gaps may close no further than to 0.
+    """
+    dt = model.dt
+    gap = jnp.maximum(contacts.separation, 0.0)
+    hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(contacts.separation <= 0, 1.0, 0.0)) > 0
+    time = jnp.clip(jnp.where(hits & (start < 0), gap / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
+    target = jnp.where(hits, 0.0, -gap / dt)
+    impact = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
+    remaining = dt - time
+    # Share of the impulse that stops the approach; the rest holds the weight for the remaining time, at half of it.
+    weight = norm(motion.gravity) * remaining
+    rest_share = safe_divide(weight, impact + weight)
+    lever = remaining * (1.0 - 0.5 * rest_share)
+    if not scene.restitution:
+        return target, lever
+    acceleration = (free - start) / dt
+    bounce_velocity, bounce_time, bounces = _bounce(scene, table, model, gap, start, acceleration)
+    return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
+
+
+def _bounce(
+    scene: Scene, table: Table, model: Model, gap: Array, start: Array, acceleration: Array
+) -> tuple[Array, Array, Array]:
+    """End velocity, time of impact and whether the contact bounces, for constant acceleration within the step.
+
+    The impact is the first root tau of ``gap + start t + acceleration t^2 / 2``. Forces act before and after it: a
+    contact bounces if, after the impact, it still separates at the end of the step. That is the only threshold.
+    """
+    dt = model.dt
+    discriminant = start * start - 2.0 * acceleration * gap
+    approach = safe_sqrt(jnp.maximum(discriminant, 0.0))  # speed at the impact
+    divisor = approach - start
+    time = safe_divide(2.0 * gap, divisor)
+    velocity = _pair_restitution(scene, table, model) * approach + acceleration * (dt - time)
+    reaches = (discriminant >= 0) & (divisor > 0) & (time <= dt) & ((start < 0) | (gap > 0))
+    bounces = settle(jnp.where(reaches & (velocity > 0), 1.0, 0.0)) > 0
+    return velocity, jnp.where(bounces, time, 0.0), bounces
+
+
+def _slot_bodies(scene: Scene, table: Table) -> tuple[np.ndarray, np.ndarray]:
+    slots = np.maximum(table.order, 0)
+    return tuple(np.asarray(side, np.int32)[slots] for side in scene.slot_bodies)  # type: ignore[return-value]
+
+
+def _signs(scene: Scene, table: Table) -> list[np.ndarray | float]:
+    """Sign of the row directions on each side: + on body B, - on body A."""
+    if len(table.blocks) == 2:
+        return [-1.0, 1.0]
+    is_static = np.asarray(scene.static)
+    signs = np.where(is_static[_slot_bodies(scene, table)[1]], -1.0, 1.0)
+    return [float(signs[0])] if (signs == signs[0]).all() else [signs[:, None]]
+
+
+def _pair_friction(scene: Scene, table: Table, model: Model) -> Array:
+    """Geometric mean (guide 8.4); derivative 0 where either coefficient is 0."""
+    a, b = _slot_bodies(scene, table)
+    return safe_sqrt(take(model.friction, a) * take(model.friction, b))
+
+
+def _pair_restitution(scene: Scene, table: Table, model: Model) -> Array:
+    """Smaller of the two coefficients (guide 8.2)."""
+    a, b = _slot_bodies(scene, table)
+    return jnp.minimum(take(model.restitution, a), take(model.restitution, b))
+
+
+def _smallest_size(scene: Scene, table: Table, model: Model) -> Array:
+    sizes = take(model.size, scene.dynamic_bodies)
+    smallest = select_blocks(table, 0, sizes)
+    return smallest if len(table.blocks) == 1 else jnp.minimum(smallest, select_blocks(table, 1, sizes))
+
+
+def position_rows(contact: ContactRows, displacement: Array, percent: float) -> Rows:
+    """Normal rows that move the bodies out of what remains of the overlap after the step (guide 10.2).
+
+    Args:
+      contact: rows of one table.
+      displacement: (turn, 1, column, world) change of the separation in this step.
+      percent: share of the overlap beyond the slop that is corrected.
+    """
+    rows = contact.rows
+    error = contact.separation + displacement + contact.slop
+    mass = rows.law.normal_mass[:, None] if isinstance(rows.law, Cone) else rows.law.effective_mass
+    return Rows(
+        jacobian=tuple(side[:, :1] for side in rows.jacobian),
+        response=tuple(side[:, :1] for side in rows.response),
+        bias=jnp.where(error < 0, percent * error, error),
+        law=_push_only(mass),
+        table=rows.table,
+    )
+
+
+def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:
+    """Impulses (turn, row, column, world) from the forces [N] of the last step, components in slot order.
+
+    The force is kept as a world vector, so that friction survives a change of the tangents, and per unit of time, so that
+    it survives a change of the time step.
+    """
+    table = contact.rows.table
+    chosen = select(table, force)
+    impulses = [dot(chosen, direction) * dt for direction in contact.directions]
+    impulses[0] = jnp.maximum(impulses[0], 0.0)
+    return pack_scalars(table, impulses, contact.rows.bias.shape[-1])
+
+
+def matched_force(scene: Scene, contacts: ContactSet, force: Vec3, feature: Array) -> Vec3:
+    """Forces of the last step in the slots where their features are now; 0 for new features (guide 7.3)."""
+    parts, slot = [], 0
+    for group in scene.pair_groups:
+        count = group.point_count
+        rows = range(slot, slot + group.slot_count)
+        old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
+        shape = (len(group.bodies_a), count, -1)
+        same = old_feature.reshape(shape)[:, None, :, :] == new_feature.reshape(shape)[:, :, None, :]
+        same = same & active.reshape(shape)[:, :, None, :]
+
+        def move(component: Array, same: Array = same, shape: tuple = shape) -> Array:
+            old = component.reshape(shape)[:, None, :, :]
+            moved = jnp.where(same, old, 0.0)
+            total = moved[:, :, 0]
+            for point in range(1, moved.shape[2]):
+                total = total + moved[:, :, point]
+            return total.reshape(-1, total.shape[-1])
+
+        parts.append(old_force.map(move))
+        slot += group.slot_count
+    if len(parts) == 1:
+        return parts[0]
+    return Vec3(*(jnp.concatenate(components) for components in zip(*parts, strict=True)))
+
+
+def slot_force(contacts: list[ContactRows], impulses: list[Array], slot_count: int, dt: Array) -> Array:
+    """(slot, 3, world) mean force on body B over the step."""
+    tables = [contact.rows.table for contact in contacts]
+    components = []
+    for axis in range(3):
+        values = []
+        for contact, impulse in zip(contacts, impulses, strict=True):
+            turns, _, columns, worlds = impulse.shape
+            total = jnp.zeros((turns, columns, worlds), impulse.dtype)
+            for row, direction in enumerate(contact.directions):
+                full = jnp.broadcast_to(direction[axis], (turns * columns, worlds)).reshape(turns, columns, worlds)
+                total = total + full * impulse[:, row]
+            values.append(total / dt)
+        components.append(collect(tables, values, slot_count))
+    return jnp.stack(components, axis=1)

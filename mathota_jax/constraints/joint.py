@@ -1,0 +1,253 @@
+"""Joint rows of a scene: joints of one kind side by side, their rows one after the other."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.bodies import Bodies, Inertia
+from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sides, respond, select, select_blocks
+from mathota_jax.constraints.joints import JOINTS
+from mathota_jax.constraints.joints.frames import JointFrames, JointRow, damping_row, joint_frames, limit_rows
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.solver.laws import Bounded
+from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.table import Constraint, Table, make_tables
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.vector import Vec3
+
+LARGEST_DECAY = 30.0
+"""Cap on damping * J M^-1 J^T * dt, beyond which the velocity left is below round-off of either precision."""
+
+
+class JointGroup(NamedTuple):
+    """Joints with the same rows."""
+
+    kind: str
+    limited: bool
+    damped: bool
+    joints: tuple[int, ...]
+
+    @property
+    def row_count(self) -> int:
+        """Rows of each joint."""
+        return JOINTS[self.kind].fixed_row_count + 2 * self.limited + self.damped
+
+
+def joint_groups(scene: Scene) -> list[JointGroup]:
+    """Groups in order of first appearance; row slots are numbered group, row, joint."""
+    members: dict[tuple[str, bool, bool], list[int]] = {}
+    for joint, entry in enumerate(scene.joints):
+        members.setdefault((entry.kind, entry.limited, entry.damped), []).append(joint)
+    return [JointGroup(*key, tuple(joints)) for key, joints in members.items()]
+
+
+def joint_row_count(scene: Scene) -> int:
+    """Number of joint rows of a scene."""
+    return sum(group.row_count * len(group.joints) for group in joint_groups(scene))
+
+
+def joint_tables(scene: Scene) -> tuple[Table, ...]:
+    """Order in which the solver visits the joint rows."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    constraints, start = [], 0
+    for group in joint_groups(scene):
+        for place, joint in enumerate(group.joints):
+            entry = scene.joints[joint]
+            blocks = tuple(block_of[body] for body in (entry.parent, entry.child) if body in block_of)
+            slots = tuple(start + row * len(group.joints) + place for row in range(group.row_count))
+            constraints.append(Constraint(blocks, slots))
+        start += group.row_count * len(group.joints)
+    return make_tables(constraints, len(block_of))
+
+
+class JointRows(NamedTuple):
+    """All joint rows in slot order, components of shape (slot, world)."""
+
+    parent: Side
+    child: Side
+    error: Array
+    damping: Array
+    one_sided: np.ndarray
+    damped: np.ndarray
+
+
+def joint_rows(model: Model, bodies: Bodies) -> JointRows:
+    """Jacobians and errors of all joint rows at the poses of all bodies."""
+    rows: list[JointRow] = []
+    counts: list[int] = []
+    for group in joint_groups(model.scene):
+        kind = JOINTS[group.kind]
+        frames = joint_frames(model, bodies, group.joints)
+        group_rows = kind.fixed_rows(frames)
+        if group.limited:
+            limits = take(model.joint_limits, group.joints)
+            group_rows += limit_rows(kind.free_sides(frames), kind.coordinate(frames), limits)
+        if group.damped:
+            group_rows.append(damping_row(kind.free_sides(frames), take(model.joint_damping, group.joints)))
+        rows += group_rows
+        counts += [len(group.joints)] * len(group_rows)
+
+    def side(name: str) -> Side:
+        sides = [getattr(row, name) for row in rows]
+        return Side(*(_stack_vectors([getattr(s, part) for s in sides], counts) for part in ("linear", "angular")))
+
+    zero = jnp.zeros((1, 1), model.dt.dtype)
+    return JointRows(
+        parent=side("parent"),
+        child=side("child"),
+        error=_stack([row.error for row in rows], counts),
+        damping=_stack([zero if row.damping is None else row.damping for row in rows], counts),
+        one_sided=np.repeat([row.one_sided for row in rows], counts),
+        damped=np.repeat([row.damping is not None for row in rows], counts),
+    )
+
+
+def _stack(values: list[Array], counts: list[int]) -> Array:
+    worlds = max(value.shape[1] for value in values)
+    return jnp.concatenate([jnp.broadcast_to(v, (count, worlds)) for v, count in zip(values, counts, strict=True)])
+
+
+def _stack_vectors(values: list[Vec3], counts: list[int]) -> Vec3:
+    return Vec3(*(_stack([value[axis] for value in values], counts) for axis in range(3)))
+
+
+def velocity_rows(scene: Scene, table: Table, model: Model, joints: JointRows, inertia: Inertia) -> Rows:
+    """Rows of one table for the velocity solver."""
+    jacobians, responses, mass = _sides(scene, table, joints, inertia)
+    error, damping, one_sided, damped = _chosen(table, joints)
+    worlds = max(mass.shape[-1], error.shape[-1])
+    pull = scene.options.baumgarte * error / model.dt
+    bias = jnp.where(damped, 0.0, jnp.where(one_sided & (error > 0), error / model.dt, pull))
+    # This softness makes a lone coordinate decay by exactly exp(-damping * J M^-1 J^T * dt) in a step.
+    decay = jnp.clip(damping * mass * model.dt, 0.0, LARGEST_DECAY)
+    # Where nothing is damped the row is void: an infinite softness, expressed by a zero effective mass.
+    moves = ~damped | (decay > 0)
+    softness = jnp.where(damped & (decay > 0), mass / jnp.expm1(jnp.where(decay > 0, decay, 1.0)), 0.0)
+    law = Bounded(
+        effective_mass=pack_scalars(table, [jnp.where(moves, 1.0 / (mass + softness), 0.0)], worlds),
+        softness=pack_scalars(table, [softness], worlds),
+        lower=_bounds(table, np.where(one_sided, 0.0, -np.inf)),
+        upper=_bounds(table, np.full(one_sided.shape, np.inf)),
+    )
+    return _pack(table, jacobians, responses, bias, law, worlds)
+
+
+def position_rows(scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia, percent: float) -> Rows:
+    """Rows of one table for the position correction; `error` (slot, world) is that after the step."""
+    jacobians, responses, mass = _sides(scene, table, joints, inertia)
+    _, _, one_sided, damped = _chosen(table, joints)
+    error = select(table, error)
+    worlds = max(mass.shape[-1], error.shape[-1])
+    free = np.where(damped, 0.0, np.inf)
+    law = Bounded(
+        effective_mass=pack_scalars(table, [1.0 / mass], worlds),
+        softness=_bounds(table, np.zeros(one_sided.shape)),
+        lower=_bounds(table, np.where(one_sided, 0.0, -free)),
+        upper=_bounds(table, free),
+    )
+    bias = jnp.where(one_sided & (error > 0), error, percent * error)
+    return _pack(table, jacobians, responses, bias, law, worlds)
+
+
+def _chosen(table: Table, joints: JointRows) -> tuple[Array, Array, np.ndarray, np.ndarray]:
+    slots = np.maximum(table.order, 0)
+    error, damping = select(table, (joints.error, joints.damping))
+    return error, damping, joints.one_sided[slots][:, None], joints.damped[slots][:, None]
+
+
+def _bounds(table: Table, values: np.ndarray) -> Array:
+    return jnp.asarray(values, jnp.float32).reshape(table.turn_count, 1, len(table.slots[0]), 1)
+
+
+def _pack(table: Table, jacobians: list[Side], responses: list[Side], bias: Array, law: Bounded, worlds: int) -> Rows:
+    return Rows(
+        jacobian=tuple(pack_sides(table, [jacobian], worlds) for jacobian in jacobians),
+        response=tuple(pack_sides(table, [response], worlds) for response in responses),
+        bias=pack_scalars(table, [bias], worlds),
+        law=law,
+        table=table,
+    )
+
+
+def _sides(scene: Scene, table: Table, joints: JointRows, inertia: Inertia) -> tuple[list[Side], list[Side], Array]:
+    """Jacobian and response of the moving bodies of a table, and ``J M^-1 J^T``."""
+    if len(table.blocks) == 2:
+        jacobians = [select(table, joints.parent), select(table, joints.child)]
+    else:
+        jacobians = [_moving_side(scene, table, joints)]
+    responses = [respond(j, select_blocks(table, side, inertia)) for side, j in enumerate(jacobians)]
+    mass = sum((inner(j, r) for j, r in zip(jacobians, responses, strict=True)), jnp.zeros(()))
+    return jacobians, responses, mass
+
+
+def _moving_side(scene: Scene, table: Table, joints: JointRows) -> Side:
+    """The side of the body that moves, where the other body is static."""
+    child_moves = np.concatenate(
+        [
+            np.tile([not scene.static[scene.joints[joint].child] for joint in group.joints], group.row_count)
+            for group in joint_groups(scene)
+        ]
+    )[np.maximum(table.order, 0)]
+    if child_moves.all():
+        return select(table, joints.child)
+    parent, child = select(table, joints.parent), select(table, joints.child)
+    parts = (
+        Vec3(*(jnp.where(child_moves[:, None], c, p) for c, p in zip(getattr(child, part), getattr(parent, part), strict=True)))
+        for part in ("linear", "angular")
+    )
+    return Side(*parts)
+
+
+def motor_forces(model: Model, bodies: Bodies, action: Array) -> tuple[Vec3, Vec3]:
+    """Forces and torques of the motors on all bodies, components (body, world).
+
+    Args:
+      action: (motor, world); clipped to the limit of each motor and multiplied by its gear.
+    """
+    scene = model.scene
+    effort = jnp.clip(action, -model.motor_limit, model.motor_limit) * model.motor_gear
+    worlds = max(effort.shape[-1], bodies.position.x.shape[-1])
+    totals = [jnp.zeros((scene.body_count, worlds), effort.dtype) for _ in range(6)]
+    for kind_name, kind in JOINTS.items():
+        motors = [motor for motor, joint in enumerate(scene.motors) if scene.joints[joint].kind == kind_name]
+        if not motors:
+            continue
+        joints = tuple(scene.motors[motor] for motor in motors)
+        sides = kind.free_sides(joint_frames(model, bodies, joints))
+        chosen = take(effort, motors)
+        for side, name in zip(sides, ("parent", "child"), strict=True):
+            receivers = np.asarray([getattr(scene.joints[joint], name) for joint in joints])
+            assert side.angular is not None
+            for axis, component in enumerate((*side.linear, *side.angular)):
+                totals[axis] = totals[axis].at[receivers].add(component * chosen)
+    return Vec3(*totals[:3]), Vec3(*totals[3:])
+
+
+def joint_coordinates(model: Model, bodies: Bodies) -> tuple[Array, Array]:
+    """Position and velocity (joint, world) of the free coordinate of every joint."""
+    scene = model.scene
+    positions: dict[int, Array] = {}
+    velocities: dict[int, Array] = {}
+    for group in joint_groups(scene):
+        kind = JOINTS[group.kind]
+        frames: JointFrames = joint_frames(model, bodies, group.joints)
+        position, velocity = kind.coordinate(frames), jnp.zeros(())
+        for side, name in zip(kind.free_sides(frames), ("parent", "child"), strict=True):
+            members = [getattr(scene.joints[joint], name) for joint in group.joints]
+            velocity = velocity + inner(side, Side(*take((bodies.velocity, bodies.angular_velocity), members)))
+        for place, joint in enumerate(group.joints):
+            positions[joint], velocities[joint] = position[place], velocity[place]
+    order = range(len(scene.joints))
+    return jnp.stack([positions[j] for j in order]), jnp.stack([velocities[j] for j in order])
+
+
+def joint_impulse_start(table: Table, force: Array, dt: Array, worlds: int) -> Array:
+    """Impulses (turn, 1, column, world) from the generalized forces of the last step (slot, world)."""
+    return pack_scalars(table, [select(table, force) * dt], worlds)
+
+

@@ -1,0 +1,1 @@
+"""Bodies in worlds-last form, their free motion and their integration."""

@@ -1,0 +1,53 @@
+"""`Model`: the differentiable parameters of a scene."""
+
+from __future__ import annotations
+
+from jax import Array
+
+from mathota_jax.scene import Scene
+from mathota_jax.struct import pytree, static
+
+
+@pytree
+class Model:
+    """Parameters of a scene; every leaf is a float array and differentiable. Made by `SceneBuilder.build`.
+
+    The static structure is `scene`; replacing a leaf (`dataclasses.replace(model, friction=...)`) never recompiles. A
+    leaf can not bring back what the scene lacks: friction raised from 0 in a scene built without friction has no effect.
+
+    Attributes:
+      dt: () time step [s].
+      gravity: (3,) acceleration [m/s^2], world frame.
+      mass: (body,) [kg]; 1 for static bodies (not used).
+      inertia: (body, 3) principal moments about the centre of mass along the body axes [kg m^2].
+      size: (body,) characteristic length of the body [m] by which tolerances scale (its inner radius).
+      friction: (body,) Coulomb coefficient; a pair uses the geometric mean.
+      restitution: (body,) Newton coefficient; a pair uses the smaller.
+      shapes: shape kind -> parameter -> (shape of that kind, ...); lengths in m.
+      joint_anchor_parent, joint_anchor_child: (joint, 3) anchor from the centre of mass, body frame [m].
+      joint_frame_parent, joint_frame_child: (joint, 4) orientation of the joint frame in each body, quaternion; the x axis
+        is the axis of the joint.
+      joint_limits: (joint, 2) lower and upper limit [rad] or [m].
+      joint_damping: (joint,) viscous coefficient [N m s/rad] or [N s/m].
+      motor_limit: (motor,) largest absolute action.
+      motor_gear: (motor,) torque [N m] or force [N] per unit of action.
+      scene: static structure.
+    """
+
+    dt: Array
+    gravity: Array
+    mass: Array
+    inertia: Array
+    size: Array
+    friction: Array
+    restitution: Array
+    shapes: dict[str, dict[str, Array]]
+    joint_anchor_parent: Array
+    joint_anchor_child: Array
+    joint_frame_parent: Array
+    joint_frame_child: Array
+    joint_limits: Array
+    joint_damping: Array
+    motor_limit: Array
+    motor_gear: Array
+    scene: Scene = static()

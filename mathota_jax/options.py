@@ -1,0 +1,62 @@
+"""Every tunable of the engine with its default, unit and place in the guide."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Settings of a simulation. All but `dt` are static: changing one compiles another program.
+
+    A damping, correction or warm start that is switched off (0 or False) is absent from the program, not multiplied by
+    zero.
+
+    Attributes:
+      dt: time step [s]. Becomes the traced leaf `Model.dt`, so that it may change between steps. Guide 11.3.
+      velocity_iterations: sweeps of the projected Gauss-Seidel solver. Guide 9.2.
+      position_iterations: sweeps of the position correction, 0 for none. Guide 10.2.
+      linear_damping: rate at which linear velocity decays [1/s]. Guide 4.2.
+      angular_damping: rate at which angular momentum decays [1/s]. Guide 4.2.
+      slop: penetration that is left alone, as a fraction of the smaller body's inner radius. Guide 10.2.
+      position_percent: share of the position error corrected in a step. Guide 10.3.
+      baumgarte: share of a joint's position error turned into velocity in a step. Guide 9.5.
+      warm_start: start the solver from the impulses of the previous step. Guide 7.3 and 12.4.
+      gradient_iterations: sweeps of the linear solver behind a derivative; None for twice `velocity_iterations`.
+    """
+
+    dt: float = 1 / 60
+    velocity_iterations: int = 10
+    position_iterations: int = 3
+    linear_damping: float = 0.01
+    angular_damping: float = 0.05
+    slop: float = 0.005
+    position_percent: float = 0.8
+    baumgarte: float = 0.1
+    warm_start: bool = True
+    gradient_iterations: int | None = None
+
+    def __post_init__(self) -> None:
+        if not (_is_number(self.dt) and self.dt > 0):
+            raise ValueError(f"Options.dt must be a positive finite number of seconds, got {self.dt!r}")
+        for name, minimum in (("velocity_iterations", 1), ("position_iterations", 0), ("gradient_iterations", 1)):
+            value = getattr(self, name)
+            optional = name == "gradient_iterations" and value is None
+            if not optional and not (isinstance(value, int) and not isinstance(value, bool) and value >= minimum):
+                raise ValueError(f"Options.{name} must be an integer of at least {minimum}, got {value!r}")
+        for name in ("linear_damping", "angular_damping", "slop"):
+            value = getattr(self, name)
+            if not (_is_number(value) and value >= 0):
+                raise ValueError(f"Options.{name} must be a finite number of at least 0, got {value!r}")
+        for name in ("position_percent", "baumgarte"):
+            value = getattr(self, name)
+            if not (_is_number(value) and 0 <= value <= 1):
+                raise ValueError(f"Options.{name} must lie between 0 and 1, got {value!r}")
+        if not isinstance(self.warm_start, bool):
+            raise ValueError(f"Options.warm_start must be True or False, got {self.warm_start!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,1 @@
+"""Projected Gauss-Seidel on rows; it knows neither contacts nor joints."""

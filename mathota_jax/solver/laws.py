@@ -1,0 +1,73 @@
+"""What an impulse may be: the projections of the projected Gauss-Seidel method, one block of rows at a time.
+
+A law maps the accumulated impulse of a block and the constraint error that it sees to the new accumulated impulse. Its
+fixed points are the solutions of the block. Arrays are (row, column, world) or, for a whole table, (turn, row, ...).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.struct import pytree
+
+
+@pytree
+class Bounded:
+    """Scalar rows ``lower <= impulse <= upper`` with optional softness (guide 9.2).
+
+    Attributes:
+      effective_mass: 1 / (J M^-1 J^T + softness), one row.
+      softness: compliance [1/effective mass]: the row strives for ``J v + bias + softness * impulse = 0``.
+      lower, upper: bounds of the accumulated impulse.
+    """
+
+    effective_mass: Array
+    softness: Array
+    lower: Array
+    upper: Array
+
+    def update(self, impulse: Array, error: Array) -> Array:
+        """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
+        free = impulse - (error + self.softness * impulse) * self.effective_mass
+        return jnp.clip(free, self.lower, self.upper)
+
+
+@pytree
+class Cone:
+    """Contact with isotropic Coulomb friction: rows normal, first tangent, second tangent.
+
+    The tangential step uses one scalar mass for both tangents (the inverse of the largest eigenvalue of their block), so
+    that a sliding contact's fixed point opposes the sliding velocity exactly: friction is a disc, not a box.
+
+    Attributes:
+      normal_mass: effective mass of the normal row.
+      tangent_mass: common effective mass of the tangent rows.
+      coupling: (2, ...) tangential velocity caused by a unit normal impulse.
+      friction: Coulomb coefficient.
+    """
+
+    normal_mass: Array
+    tangent_mass: Array
+    coupling: Array
+    friction: Array
+
+    def update(self, impulse: Array, error: Array) -> Array:
+        """Normal row first, then the tangents with the normal's new impulse."""
+        row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
+        old_n, old_1, old_2 = jnp.moveaxis(impulse, row, 0)
+        error_n, error_1, error_2 = jnp.moveaxis(error, row, 0)
+        coupling_1, coupling_2 = jnp.moveaxis(self.coupling, row, 0)
+        normal = jnp.maximum(old_n - error_n * self.normal_mass, 0.0)
+        change = normal - old_n
+        free_1 = old_1 - (error_1 + coupling_1 * change) * self.tangent_mass
+        free_2 = old_2 - (error_2 + coupling_2 * change) * self.tangent_mass
+        squared = free_1 * free_1 + free_2 * free_2
+        limit = self.friction * normal
+        sliding = squared > limit * limit
+        scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
+        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=row)
+
+
+Law = Bounded | Cone

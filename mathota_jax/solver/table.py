@@ -1,0 +1,98 @@
+"""Order in which a sweep visits the rows, fixed at build time: turns of rows that share no moving body.
+
+Rows of one turn are solved side by side as one vector operation; turns follow one another. A greedy colouring of the
+constraints gives the turns: two constraints may share a colour if they share no moving body.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+EMPTY = -1
+
+
+class Constraint(NamedTuple):
+    """Rows that act on the same velocity blocks. `blocks` has one entry (other body static) or two."""
+
+    blocks: tuple[int, ...]
+    slots: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Turns of a sweep over constraints that all have the same number of moving bodies.
+
+    Attributes:
+      slots: (turn, column) slot solved there, EMPTY for padding.
+      blocks: for each side, (turn, column) velocity block; padding points at block `block_count`, which does not exist.
+      block_count: number of velocity blocks.
+    """
+
+    slots: tuple[tuple[int, ...], ...]
+    blocks: tuple[tuple[tuple[int, ...], ...], ...]
+    block_count: int
+
+    @property
+    def turn_count(self) -> int:
+        """Number of turns in one sweep."""
+        return len(self.slots)
+
+    @functools.cached_property
+    def order(self) -> np.ndarray:
+        """(turn * column,) slots in the order of the table, EMPTY for padding."""
+        return np.asarray(self.slots, np.int32).reshape(-1)
+
+    @functools.cached_property
+    def receivers(self) -> np.ndarray:
+        """(turn, block) column of the concatenated sides whose impulse the block gets; the one past the end for none."""
+        columns = len(self.slots[0])
+        receivers = np.full((self.turn_count, self.block_count + 1), len(self.blocks) * columns, np.int32)
+        for side, blocks in enumerate(self.blocks):
+            for turn, row in enumerate(blocks):
+                receivers[turn, list(row)] = side * columns + np.arange(columns)
+        return receivers[:, : self.block_count]
+
+
+def make_tables(constraints: Sequence[Constraint], block_count: int) -> tuple[Table, ...]:
+    """Tables that together visit every slot once: first the one-sided constraints, then the two-sided."""
+    tables = []
+    for side_count in (1, 2):
+        chosen = [constraint for constraint in constraints if len(constraint.blocks) == side_count]
+        if chosen:
+            tables.append(_make_table(chosen, side_count, block_count))
+    return tuple(tables)
+
+
+def _make_table(constraints: list[Constraint], side_count: int, block_count: int) -> Table:
+    turns: list[list[tuple[int, tuple[int, ...]]]] = []
+    for colour in _colour(constraints):
+        for row in range(max(len(constraint.slots) for constraint in colour)):
+            turns.append([(c.slots[row], c.blocks) for c in colour if row < len(c.slots)])
+    width = max(len(turn) for turn in turns)
+    padding = (EMPTY, (block_count,) * side_count)
+    padded = [turn + [padding] * (width - len(turn)) for turn in turns]
+    return Table(
+        slots=tuple(tuple(slot for slot, _ in turn) for turn in padded),
+        blocks=tuple(tuple(tuple(blocks[side] for _, blocks in turn) for turn in padded) for side in range(side_count)),
+        block_count=block_count,
+    )
+
+
+def _colour(constraints: list[Constraint]) -> list[list[Constraint]]:
+    """Greedy colouring in the given order."""
+    colours: list[tuple[set[int], list[Constraint]]] = []
+    for constraint in constraints:
+        for used, members in colours:
+            if used.isdisjoint(constraint.blocks):
+                break
+        else:
+            used, members = set(), []
+            colours.append((used, members))
+        used.update(constraint.blocks)
+        members.append(constraint)
+    return [members for _, members in colours]

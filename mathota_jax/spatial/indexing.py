@@ -1,0 +1,27 @@
+"""Selection of rows by indices known at trace time, by the cheapest operation that does it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def take(tree: Any, indices: Sequence[int] | np.ndarray, axis: int = 0) -> Any:
+    """Rows `indices` (static) along `axis` of every array of a pytree.
+
+    A constant index gives one row (to be broadcast), a range a slice; both are free, where a gather costs an address
+    computation for each element.
+    """
+    index = np.asarray(indices, np.int32)
+    if len(index) and (index == index[0]).all():
+        return jax.tree.map(lambda x: jax.lax.slice_in_dim(x, int(index[0]), int(index[0]) + 1, axis=axis), tree)
+    if len(index) and (np.diff(index) == 1).all():
+        start, stop = int(index[0]), int(index[-1]) + 1
+        return jax.tree.map(
+            lambda x: x if stop - start == x.shape[axis] else jax.lax.slice_in_dim(x, start, stop, axis=axis), tree
+        )
+    return jax.tree.map(lambda x: jnp.take(x, index, axis=axis, unique_indices=False, mode="clip"), tree)

@@ -1,0 +1,63 @@
+"""Unit quaternions ``(w, x, y, z)``, world from body, components in separate arrays."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from mathota_jax.spatial.settle import compute_once, opaque_one
+from mathota_jax.spatial.vector import Mat3, Vec3, dot
+
+
+class Quaternion(NamedTuple):
+    """Quaternion with scalar part first."""
+
+    w: Any
+    x: Any
+    y: Any
+    z: Any
+
+
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Hamilton product: the rotation `q` followed by the rotation `p` (guide 1.2)."""
+    return Quaternion(
+        p.w * q.w - p.x * q.x - p.y * q.y - p.z * q.z,
+        p.w * q.x + p.x * q.w + p.y * q.z - p.z * q.y,
+        p.w * q.y - p.x * q.z + p.y * q.w + p.z * q.x,
+        p.w * q.z + p.x * q.y - p.y * q.x + p.z * q.w,
+    )
+
+
+def normalize(q: Quaternion) -> Quaternion:
+    """Projects back to the unit sphere. Undefined (NaN) for the zero quaternion, which the flags report."""
+    inverse = 1.0 / jnp.sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z)
+    return Quaternion(q.w * inverse, q.x * inverse, q.y * inverse, q.z * inverse)
+
+
+def to_matrix(q: Quaternion) -> Mat3:
+    """Rotation matrix of a unit quaternion (guide 1.2)."""
+    x2, y2, z2 = q.x + q.x, q.y + q.y, q.z + q.z
+    wx, wy, wz = q.w * x2, q.w * y2, q.w * z2
+    xx, xy, xz = q.x * x2, q.x * y2, q.x * z2
+    yy, yz, zz = q.y * y2, q.y * z2, q.z * z2
+    return Mat3(
+        Vec3(1.0 - (yy + zz), xy + wz, xz - wy),
+        Vec3(xy - wz, 1.0 - (xx + zz), yz + wx),
+        Vec3(xz + wy, yz - wx, 1.0 - (xx + yy)),
+    )
+
+
+def exponential(rotation_vector: Vec3) -> Quaternion:
+    """Quaternion of a rotation vector [rad]; smooth at zero.
+
+    Below a quarter turn squared of 1e-6 the series of sin(t)/t and cos(t) is exact to float64 round-off of the result.
+    """
+    quarter = 0.25 * dot(rotation_vector, rotation_vector)  # square of the half angle
+    small = quarter < 1e-6
+    half = jnp.sqrt(jnp.where(small, 1.0, quarter))
+    sinc = jnp.where(small, 1.0 - quarter * (1.0 / 6.0 - quarter / 120.0), jnp.sin(half) / half)
+    cosine = jnp.where(small, 1.0 - quarter * (0.5 - quarter / 24.0), jnp.cos(half))
+    # Each serves several components; trigonometry is worth doing once.
+    scale, cosine = compute_once((0.5 * sinc, cosine), opaque_one(quarter, quarter.dtype))
+    return Quaternion(cosine, rotation_vector.x * scale, rotation_vector.y * scale, rotation_vector.z * scale)

@@ -1,0 +1,80 @@
+"""`State`: everything that changes from step to step."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.struct import pytree
+
+
+class Flag(enum.IntFlag):
+    """Bits of `State.flags`. Bits stay set until the user clears them."""
+
+    NON_FINITE = 1
+    """A position or velocity of this world became NaN or infinite, or an orientation lost its length."""
+
+
+@pytree
+class State:
+    """State of one world (or of many, with leading axes, under `jax.vmap`).
+
+    Attributes:
+      position: (body, 3) centres of mass [m], world frame.
+      orientation: (body, 4) unit quaternions (w, x, y, z), world from body.
+      velocity: (body, 3) of the centres of mass [m/s], world frame.
+      angular_velocity: (body, 3) [rad/s], world frame.
+      applied_force: (body, 3) force accumulated for the next step [N], world frame.
+      applied_torque: (body, 3) torque about the centre of mass accumulated for the next step [N m], world frame.
+      contact_force: (slot, 3) mean force of the last step on body B of each contact slot [N], world frame.
+      contact_feature: (slot,) feature that held each slot in the last step, -1 for none.
+      joint_force: (joint row,) mean generalized force of each joint row in the last step [N] or [N m].
+      flags: () bits of `Flag`; 0 when all is well.
+    """
+
+    position: Array
+    orientation: Array
+    velocity: Array
+    angular_velocity: Array
+    applied_force: Array
+    applied_torque: Array
+    contact_force: Array
+    contact_feature: Array
+    joint_force: Array
+    flags: Array
+
+
+def apply_force(state: State, body: int, force: Array, point: Array | None = None) -> State:
+    """Accumulates a force on a body until the next step (guide 3.3). Differentiable.
+
+    Args:
+      state: state of one world.
+      body: handle of the body.
+      force: (3,) force [N], world frame.
+      point: (3,) point of application [m], world frame; None for the centre of mass.
+
+    Returns:
+      State with the force, and its torque about the centre of mass, added to what was applied before.
+
+    Raises:
+      ValueError: `body` is out of range, or `force` or `point` is not a vector of three components.
+    """
+    body_count = state.position.shape[-2]
+    if not 0 <= int(body) < body_count:
+        raise ValueError(f"apply_force: body must lie between 0 and {body_count - 1}, got {body}")
+    force = _vector("force", force)
+    applied = dataclasses.replace(state, applied_force=state.applied_force.at[body].add(force))
+    if point is None:
+        return applied
+    torque = jnp.cross(_vector("point", point) - state.position[body], force)
+    return dataclasses.replace(applied, applied_torque=state.applied_torque.at[body].add(torque))
+
+
+def _vector(name: str, value: Array) -> Array:
+    value = jnp.asarray(value)
+    if value.shape != (3,):
+        raise ValueError(f"apply_force: {name} must have shape (3,), got {value.shape}")
+    return value

@@ -1,0 +1,68 @@
+"""Fixtures of the whole suite: precision, gates with their measured values, and a compilation cache per worker."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+
+import jax
+import numpy as np
+import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--gates", action="store_true", help="print every gate beside the measured value")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keeps compiled programs between runs.
+
+    JAX writes cache entries without a lock, so parallel pytest-xdist workers get a directory each.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "main")
+    cache = config.rootpath / ".pytest_cache" / "jax" / worker
+    cache.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+@pytest.fixture(params=["float32", "float64"])
+def precision(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Runs the test once in each floating-point precision."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    """Runs the test in double precision."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture
+def gate(record_property: Callable[[str, object], None]) -> Callable[[str, object, float], None]:
+    """Asserts `|measured| <= limit` and records both, for ``pytest --gates``."""
+
+    def check(name: str, measured: object, limit: float) -> None:
+        worst = float(np.max(np.abs(np.asarray(measured, dtype=float))))
+        record_property("gate", (name, worst, limit))
+        assert worst <= limit, f"{name}: measured {worst:.6g}, gate {limit:.6g}"  # NaN fails as well
+
+    return check
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if not config.getoption("--gates"):
+        return
+    terminalreporter.section("gates: measured <= limit")
+    for outcome in ("passed", "failed"):
+        for report in terminalreporter.stats.get(outcome, []):
+            for key, value in getattr(report, "user_properties", ()):
+                if key == "gate":
+                    name, measured, limit = value
+                    mark = "  " if measured <= limit else "! "
+                    terminalreporter.write_line(
+                        f"{mark}{report.nodeid.removeprefix('tests/')}: {name}: {measured:.3g} <= {limit:.3g}"
+                    )

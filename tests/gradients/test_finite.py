@@ -1,0 +1,80 @@
+"""No derivative is ever NaN: at rest, touching, never touching, coincident, for every pair of shapes and a joint."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import Box, Capsule, Hinge, Plane, SceneBuilder, Slider, Sphere, contacts, energy, rollout
+from tests.scenes import DOWN, stack, undamped
+
+HALF = 0.1  # every shape reaches this far below its centre
+
+
+def everything(restitution):
+    """Two bodies of each kind on a plane, and a jointed pair with limits and a motor."""
+    builder = SceneBuilder(gravity=DOWN)
+    surface = {"friction": 0.5, "restitution": restitution}
+    ground = builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, **surface)
+    for shape in (Sphere(HALF), Box((HALF, HALF, HALF)), Capsule(0.04, 0.06)):
+        for _ in range(2):
+            builder.add_body(shape, mass=1.0, **surface)
+    lever = builder.add_body(Box((0.02, 0.1, 0.02)), mass=0.5, position=(5.0, 1.0, 0.0), **surface)
+    hinge = builder.add_joint(
+        Hinge(parent=ground, child=lever, anchor=(5, 1.1, 0), axis=(0, 0, 1), limits=(-0.5, 0.5), damping=0.01)
+    )
+    builder.add_motor(hinge, kind="torque", limit=1.0)
+    cart = builder.add_body(Sphere(0.1), mass=0.5, position=(7.0, 1.0, 0.0), **surface)
+    slider = builder.add_joint(Slider(parent=ground, child=cart, anchor=(7, 1, 0), axis=(1, 0, 0), limits=(0.0, 0.5)))
+    builder.add_motor(slider, kind="force", limit=1.0)
+    return builder.build(undamped(dt=1 / 60))
+
+
+def placements():
+    """Centres of the six free bodies in each situation."""
+    apart = np.array([[0.5 * index, 0.0, 0.0] for index in range(6)])
+    up = np.array([0.0, HALF, 0.0])
+    row = np.array([[2 * HALF * index, HALF, 0.0] for index in range(6)])
+    return {
+        "resting on the plane": apart + up,
+        "never touching": apart + 3 * up + [0.0, 10.0, 0.0],
+        "touching one another in a row": row,
+        "a hair apart": row * [1.0 + 1e-7, 1.0, 1.0],
+        "all coincident": np.tile(up, (6, 1)),
+        "coincident in pairs": np.repeat(apart[::2], 2, axis=0) + up,
+        "centre on the plane": apart,
+        "below the plane": apart - up,
+    }
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5])
+def test_every_gradient_is_finite(precision, restitution):
+    model, state = everything(restitution)
+    names = list(placements())
+    states = stack(
+        [dataclasses.replace(state, position=state.position.at[1:7].set(jnp.asarray(p))) for p in placements().values()]
+    )
+    # Moving as well as resting: an impact must not divide by a vanishing approach speed.
+    moving = dataclasses.replace(states, velocity=states.velocity.at[:, 1:7, 1].add(-0.5))
+    states = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), states, moving)
+    names = [f"{name}, {motion}" for motion in ("at rest", "moving down") for name in names]
+    weights = [np.random.default_rng(3).normal(size=(9, size)) for size in (3, 4, 3, 3)]
+
+    def loss(model, state, action):
+        final, _ = rollout(model, state, jnp.broadcast_to(action, (2, 2)))
+        leaves = (final.position, final.orientation, final.velocity, final.angular_velocity)
+        found = contacts(model, final)
+        seen = jnp.sum(found.separation) + jnp.sum(found.normal) + jnp.sum(found.position)
+        return sum(jnp.sum(w * leaf) for w, leaf in zip(weights, leaves, strict=True)) + energy(model, final) + seen
+
+    gradient = jax.grad(loss, argnums=(0, 1, 2), allow_int=True)
+    batch = jax.jit(jax.vmap(gradient, in_axes=(None, 0, None)))(model, states, jnp.array([0.3, -0.2]))
+    bad = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(batch):
+        if leaf.dtype == jax.dtypes.float0:
+            continue
+        finite = np.isfinite(np.asarray(leaf)).reshape(len(names), -1).all(axis=1)
+        bad += [f"{name}: d / d {jax.tree_util.keystr(path)}" for name, ok in zip(names, finite, strict=True) if not ok]
+    assert not bad, "not finite:\n" + "\n".join(bad)

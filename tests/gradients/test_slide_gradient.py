@@ -1,0 +1,90 @@
+"""Derivatives of sliding to rest against the closed form (benchmark C6)."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import rollout
+from tests.scenes import GRAVITY, slab_on_plane, undamped
+
+SPEED, FRICTION = 2.0, 0.4
+DT = 1 / 240
+LIMIT = {"float32": 0.01, "float64": 0.01}
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def end_of_slide(parameters, model, state, count):
+    """Final position and velocity along the slide as a function of speed, friction, mass and gravity."""
+    model = dataclasses.replace(
+        model,
+        friction=jnp.full_like(model.friction, parameters["friction"]),
+        mass=model.mass.at[1].set(parameters["mass"]),
+        inertia=model.inertia.at[1].multiply(parameters["mass"]),
+        gravity=jnp.array([0.0, -1.0, 0.0]) * parameters["gravity"],
+    )
+    state = dataclasses.replace(state, velocity=state.velocity.at[1, 0].set(parameters["speed"]))
+    final, _ = rollout(model, state, count)
+    return final.position[1, 0], final.velocity[1, 0]
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def derivatives(parameters, model, state, count):
+    return jax.jacrev(end_of_slide)(parameters, model, state, count)
+
+
+def slide(time):
+    model, state = slab_on_plane(friction=FRICTION, options=undamped(dt=DT))
+    parameters = {"speed": SPEED, "friction": FRICTION, "mass": 1.0, "gravity": GRAVITY}
+    parameters = {name: jnp.asarray(value) for name, value in parameters.items()}
+    count = round(time / DT)
+    return end_of_slide(parameters, model, state, count), derivatives(parameters, model, state, count)
+
+
+def check(gate, what, measured, truth, limit, scale=None):
+    for name, value in truth.items():
+        size = abs(value) if value else (scale or {}).get(name, 1.0)
+        gate(f"d {what} / d {name} against {value:.6g}", (float(measured[name]) - value) / size, limit)
+
+
+def test_while_sliding(precision, gate):
+    (_, speed), (position_slopes, velocity_slopes) = slide(time := 0.25)
+    gate("speed [m/s]", speed - (SPEED - FRICTION * GRAVITY * time), 1e-3)
+    half = 0.5 * time**2
+    truth = {"speed": time, "friction": -GRAVITY * half, "gravity": -FRICTION * half}
+    assert truth["friction"] == pytest.approx(-0.3065625)
+    check(gate, "x", position_slopes, truth, LIMIT[precision])
+    truth = {"speed": 1.0, "friction": -GRAVITY * time, "gravity": -FRICTION * time}
+    check(gate, "v", velocity_slopes, truth, LIMIT[precision])
+    gate("d x / d mass", position_slopes["mass"], {"float32": 1e-5, "float64": 1e-6}[precision])
+    gate("d v / d mass", velocity_slopes["mass"], {"float32": 1e-5, "float64": 1e-6}[precision])
+
+
+def test_after_stopping(precision, gate):
+    (position, speed), (position_slopes, velocity_slopes) = slide(0.75)
+    distance = SPEED**2 / (2 * FRICTION * GRAVITY)
+    gate("distance / truth - 1", position / distance - 1, 0.01)
+    gate("speed at rest [m/s]", speed, 1e-4)
+    truth = {
+        "speed": SPEED / (FRICTION * GRAVITY),
+        "friction": -distance / FRICTION,
+        "gravity": -distance / GRAVITY,
+    }
+    np.testing.assert_allclose(list(truth.values()), [0.509684, -1.274210, -0.051956], atol=1e-6)
+    check(gate, "x", position_slopes, truth, LIMIT[precision])
+    gate("d x / d mass", position_slopes["mass"], {"float32": 1e-5, "float64": 1e-6}[precision])
+    for name, value in velocity_slopes.items():
+        gate(f"d v / d {name} at rest", value, 1e-3)
+
+
+def test_forward_mode_equals_reverse_mode(float64):
+    model, state = slab_on_plane(friction=FRICTION, options=undamped(dt=DT))
+    parameters = {"speed": SPEED, "friction": FRICTION, "mass": 1.0, "gravity": GRAVITY}
+    parameters = {name: jnp.asarray(value) for name, value in parameters.items()}
+    forward = jax.jit(jax.jacfwd(functools.partial(end_of_slide, count=60)))(parameters, model, state)
+    reverse = derivatives(parameters, model, state, 60)
+    for a, b in zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)

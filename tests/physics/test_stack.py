@@ -1,0 +1,46 @@
+"""Ten boxes stand still, and every level carries exactly what lies above it."""
+
+import jax
+import numpy as np
+import pytest
+
+from mathota_jax import Options, contact_forces, contacts
+from tests.scenes import advance, box_stack, motion_and_penetration, record_worlds, repeat
+
+COUNT, DEFAULT_GRAVITY = 10, 9.81
+
+
+def test_ten_boxes_stand(precision, gate):
+    model, state = box_stack(COUNT)
+    final, record = record_worlds(repeat(model, 1), repeat(state, 1), 1200, motion_and_penetration)
+    start = np.asarray(state.position, dtype=float)[1:]
+    moved = np.asarray(record["position"], dtype=float)[:, 0, 1:] - start
+    gate("penetration in 5 s [m]", record["penetration"], 1e-3)
+    gate("horizontal drift in 5 s [m]", np.linalg.norm(moved[..., [0, 2]], axis=-1), 1e-3)
+    gate("vertical drift of any box in 5 s [m]", moved[..., 1], 1e-3)
+    gate("speed at the end [m/s]", final.velocity[0, 1:], 1e-3)
+    assert int(final.flags[0]) == 0
+
+
+def test_each_level_carries_the_weight_above_it(precision, gate):
+    model, state = box_stack(COUNT)
+    final = advance(model, state, 480)
+    found = jax.jit(contacts)(model, final)
+    forces = np.asarray(jax.jit(contact_forces)(model, final), dtype=float)
+    lower = np.minimum(np.asarray(found.body_a), np.asarray(found.body_b))
+    upper = np.maximum(np.asarray(found.body_a), np.asarray(found.body_b))
+    sign = np.where(np.asarray(found.body_b) == upper, 1.0, -1.0)  # the force acts on B
+    weight = float(model.mass[1]) * DEFAULT_GRAVITY
+    for level in range(COUNT):
+        between = (lower == level) & (upper == level + 1)
+        carried = np.sum(sign[between, None] * forces[between], axis=0)
+        gate(f"force under box {level + 1} / weight above", carried / ((COUNT - level) * weight) - [0, 1, 0], 0.01)
+
+
+@pytest.mark.parametrize("warm_start", [True, False])
+def test_warm_start_is_what_carries_a_tall_stack(float64, warm_start):
+    """Cold sweeps need about 1.86 N^2 = 186 iterations for ten boxes (benchmark B3); ten of them must fall short."""
+    model, state = box_stack(COUNT, options=Options(dt=1 / 240, warm_start=warm_start))
+    final = advance(model, state, 240)
+    sink = float(state.position[-1, 1] - final.position[-1, 1])
+    assert (sink < 1e-3) == warm_start

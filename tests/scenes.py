@@ -1,0 +1,189 @@
+"""Scenes described by numbers, and compiled runners that every test shares.
+
+The runners are module-level jitted functions: tests that use the same scene, batch size and precision share one
+compilation. Time steps, gravity, friction, restitution and masses are traced, so a whole grid of them is one program.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, contacts, step
+
+GRAVITY = 9.81
+DOWN = (0.0, -GRAVITY, 0.0)
+
+
+def undamped(**changes: Any) -> Options:
+    """Options without the stabilising damping, which no closed form contains."""
+    return Options(**{"linear_damping": 0.0, "angular_damping": 0.0, **changes})
+
+
+# Runners -------------------------------------------------------------------------------------------------------------
+
+
+@jax.jit
+def advance(model: Any, state: Any, step_count: Any, action: Any = None) -> Any:
+    """State of one world after `step_count` steps; the count is traced, so it never recompiles."""
+    return jax.lax.fori_loop(0, step_count, lambda _, current: step(model, current, action), state)
+
+
+@jax.jit
+def advance_worlds(models: Any, states: Any, step_count: Any, actions: Any = None) -> Any:
+    """The same for a batch of worlds whose every model leaf, state leaf and action is mapped."""
+    return jax.lax.fori_loop(0, step_count, lambda _, current: jax.vmap(step)(models, current, actions), states)
+
+
+@functools.partial(jax.jit, static_argnames=("step_count", "observe"))
+def record_worlds(models: Any, states: Any, step_count: int, observe: Callable, actions: Any = None) -> tuple[Any, Any]:
+    """Final states and `observe(model, state)` after every step; leading axes of the record: (step, world)."""
+
+    def body(current: Any, _: None) -> tuple[Any, Any]:
+        following = jax.vmap(step)(models, current, actions)
+        return following, jax.vmap(observe)(models, following)
+
+    return jax.lax.scan(body, states, None, length=step_count)
+
+
+def motion(model: Any, state: Any) -> dict[str, Any]:
+    """The whole motion of the bodies, for `record_worlds`."""
+    return {
+        "position": state.position,
+        "orientation": state.orientation,
+        "velocity": state.velocity,
+        "angular_velocity": state.angular_velocity,
+    }
+
+
+def motion_and_penetration(model: Any, state: Any) -> dict[str, Any]:
+    """`motion` and the deepest overlap of any active contact [m]."""
+    found = contacts(model, state)
+    depth = jnp.max(jnp.where(found.active, -found.separation, 0.0), initial=0.0)
+    return {**motion(model, state), "penetration": depth}
+
+
+# Batches -------------------------------------------------------------------------------------------------------------
+
+
+def stack(trees: Sequence[Any]) -> Any:
+    """One batch from worlds of the same scene: every leaf gets a leading world axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def repeat(tree: Any, count: int) -> Any:
+    """A batch of `count` equal worlds."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), tree)
+
+
+def per_body(values: Any, like: Any) -> Any:
+    """One value a world, (world,), spread over the bodies of the leaf `like`, (world, body)."""
+    return jnp.broadcast_to(jnp.asarray(values, dtype=like.dtype)[:, None], like.shape)
+
+
+def with_dt(tree: Any, dt: float) -> Any:
+    """The model, or batch of models, with another time step [s]."""
+    return dataclasses.replace(tree, dt=jnp.full_like(tree.dt, dt))
+
+
+def tilted_gravity(angle_degrees: Any, magnitude: float = GRAVITY) -> np.ndarray:
+    """Gravity as seen from a slope whose downhill direction is +X: (..., 3) [m/s^2]."""
+    angle = np.radians(np.asarray(angle_degrees, dtype=float))
+    return magnitude * np.stack([np.sin(angle), -np.cos(angle), np.zeros_like(angle)], axis=-1)
+
+
+# Scenes --------------------------------------------------------------------------------------------------------------
+
+
+def body_on_plane(
+    shape: Any,
+    *,
+    gravity: Sequence[float] = DOWN,
+    friction: float = 0.5,
+    restitution: float = 0.0,
+    options: Options | None = None,
+    **body: Any,
+) -> tuple[Any, Any]:
+    """Body 0: the plane y = 0. Body 1: `shape`, of mass 1 unless said otherwise."""
+    builder = SceneBuilder(gravity=gravity)
+    surface = {"friction": friction, "restitution": restitution}
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, **surface)
+    builder.add_body(shape, **{"mass": 1.0, **surface, **body})
+    return builder.build(options or undamped())
+
+
+def slab_on_plane(**changes: Any) -> tuple[Any, Any]:
+    """The 0.4 x 0.1 x 0.4 m slab of benchmarks A9 and A10, at rest on the plane."""
+    return body_on_plane(Box((0.2, 0.05, 0.2)), **{"position": (0.0, 0.05, 0.0), **changes})
+
+
+def sphere_on_plane(height: float = 0.0, **changes: Any) -> tuple[Any, Any]:
+    """A sphere of radius 0.1 m whose lowest point is `height` above the plane."""
+    return body_on_plane(Sphere(0.1), **{"position": (0.0, 0.1 + height, 0.0), **changes})
+
+
+def box_stack(count: int = 10, half: float = 0.1, options: Options | None = None, **body: Any) -> tuple[Any, Any]:
+    """Body 0: the plane. Bodies 1 to `count`: cubes stacked exactly touching, 1 kg each."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, **body)
+    for level in range(count):
+        builder.add_body(Box((half, half, half)), mass=1.0, position=(0.0, half * (2 * level + 1), 0.0), **body)
+    return builder.build(options or Options(dt=1 / 240))
+
+
+# Truths --------------------------------------------------------------------------------------------------------------
+
+
+def rotation_matrix(quaternion: Any) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (w, x, y, z), in NumPy."""
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, dtype=float), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def axis_angle(axis: Any, angle: float) -> np.ndarray:
+    """Quaternion (w, x, y, z) of a turn by `angle` [rad] about `axis`."""
+    unit = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * unit])
+
+
+def quaternion_product(p: Any, q: Any) -> np.ndarray:
+    """Hamilton product of two quaternions (w, x, y, z): first the turn `q`, then `p`."""
+    pw, pv = p[0], np.asarray(p[1:], dtype=float)
+    qw, qv = q[0], np.asarray(q[1:], dtype=float)
+    return np.concatenate([[pw * qw - pv @ qv], pw * qv + qw * pv + np.cross(pv, qv)])
+
+
+def angle_between(p: Any, q: Any) -> np.ndarray:
+    """Angle [rad] of the turn between two unit quaternions (..., 4); exact for small angles as well."""
+    p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    sign = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    return 4 * np.arcsin(np.clip(np.linalg.norm(p - sign * q, axis=-1) / 2, 0, 1))
+
+
+def invariants(
+    model: Any, position: Any, orientation: Any, velocity: Any, angular_velocity: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Kinetic energy (...), linear and angular momentum (..., 3) of the moving bodies, in NumPy float64.
+
+    `model` is one world's; bodies of infinite or zero mass (the static ones) must not be passed in the arrays.
+    """
+    mass, inertia = (np.asarray(leaf, dtype=float) for leaf in (model["mass"], model["inertia"]))
+    position, velocity, omega = (np.asarray(leaf, dtype=float) for leaf in (position, velocity, angular_velocity))
+    rotation = rotation_matrix(orientation)
+    body_omega = np.einsum("...ji,...j->...i", rotation, omega)
+    spin = np.einsum("...ij,...j->...i", rotation, inertia * body_omega)
+    kinetic = 0.5 * np.sum(mass * np.sum(velocity**2, -1) + np.sum(spin * omega, -1), axis=-1)
+    linear = np.sum(mass[..., None] * velocity, axis=-2)
+    angular = np.sum(np.cross(position, mass[..., None] * velocity) + spin, axis=-2)
+    return kinetic, linear, angular

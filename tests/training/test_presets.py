@@ -1,0 +1,42 @@
+"""The arithmetic of rollouts and minibatches."""
+
+from dataclasses import replace
+
+import pytest
+
+from training.presets import PRESETS, Hyperparameters, preset
+
+
+@pytest.mark.parametrize("worlds", [1, 3, 32, 100, 5000])
+@pytest.mark.parametrize("steps", [1, 1000, 10**6])
+def test_minibatches_divide_the_samples(worlds, steps):
+    hyperparameters = Hyperparameters(worlds=worlds, steps=steps)
+    samples = hyperparameters.rollout_length * worlds
+    assert hyperparameters.minibatch_size * hyperparameters.minibatch_count == samples
+    assert samples >= min(hyperparameters.samples_per_update, steps)
+    assert hyperparameters.update_count * samples >= steps > (hyperparameters.update_count - 1) * samples
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("worlds", 0),
+        ("steps", 1.5),
+        ("learning_rate", 0.0),
+        ("learning_rate", float("nan")),
+        ("discount", 1.1),
+        ("trace_decay", -0.1),
+        ("clip_range", 0.0),
+    ],
+)
+def test_impossible_hyperparameters_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        replace(Hyperparameters(), **{name: value})
+
+
+def test_presets_name_known_environments_and_backends():
+    registration = pytest.importorskip("mathota_envs.registration")
+    assert {(environment, backend) for environment in registration.ENVIRONMENTS for backend in ("sb3", "jax")} == set(
+        PRESETS
+    )
+    assert preset("somebody/Else-v0", "jax") == Hyperparameters()

@@ -1,0 +1,233 @@
+"""`jax.vmap(step)` and every derivative of it equal a Python loop over unbatched calls."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import Hinge, Plane, SceneBuilder, Sphere, rollout, step
+from tests.scenes import stack, undamped
+
+WORLDS, STEPS = 3, 3
+
+
+def scene():
+    """A ball that slides and bounces a little, and a motorised arm: contact, friction, restitution, joint, action."""
+    builder = SceneBuilder()
+    ground = builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, friction=0.3, restitution=0.4)
+    builder.add_body(
+        Sphere(0.1), mass=1.0, position=(0, 0.105, 0), velocity=(2.0, -1.0, 0.3), friction=0.3, restitution=0.4
+    )
+    arm = builder.add_body(Sphere(0.1), mass=0.5, position=(3.0, 1.0, 0.0))
+    hinge = builder.add_joint(Hinge(parent=ground, child=arm, anchor=(3.2, 1.0, 0.0), axis=(0, 0, 1), damping=0.1))
+    builder.add_motor(hinge, kind="torque", limit=5.0)
+    return builder.build(undamped(dt=1 / 60))
+
+
+def apply(parameters):
+    """Model, state and action of one world from a vector: speed, friction, mass, action."""
+    model, state = scene()
+    model = dataclasses.replace(
+        model,
+        friction=jnp.full_like(model.friction, parameters[1]),
+        mass=model.mass.at[1].set(parameters[2]),
+    )
+    return model, dataclasses.replace(state, velocity=state.velocity.at[1, 0].set(parameters[0])), parameters[3:]
+
+
+def outcome(parameters):
+    """(position, velocity, spin, arm) after three steps, as one vector."""
+    model, state, action = apply(parameters)
+    final, _ = rollout(model, state, jnp.broadcast_to(action, (STEPS, 1)))
+    return jnp.concatenate([final.position[1], final.velocity[1], final.angular_velocity[1], final.velocity[2]])
+
+
+def cost(parameters):
+    return jnp.sum(jnp.sin(outcome(parameters)))
+
+
+def parameters():
+    rng = np.random.default_rng(5)
+    return jnp.asarray(rng.uniform([1.5, 0.2, 0.8, -1.0], [2.5, 0.4, 1.2, 1.0], size=(WORLDS, 4)))
+
+
+def loop(function, batch):
+    compiled = jax.jit(function)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *[compiled(one) for one in batch])
+
+
+def finite_differences(function, batch, width=1e-6):
+    """Central differences of unbatched calls: (world, output..., parameter)."""
+    compiled = jax.jit(function)
+    directions = width * np.eye(batch.shape[1])
+    return np.stack(
+        [
+            np.stack([(compiled(one + d) - compiled(one - d)) / (2 * width) for d in directions], axis=-1)
+            for one in batch
+        ]
+    )
+
+
+def diagonal(blocks):
+    """(world, output, world, parameter) -> (world, output, parameter); the rest must vanish."""
+    blocks = np.asarray(blocks)
+    for first in range(WORLDS):
+        for second in range(WORLDS):
+            assert first == second or not np.any(blocks[first, :, second])
+    return np.stack([blocks[world, :, world] for world in range(WORLDS)])
+
+
+def test_derivatives_against_finite_differences(float64):
+    """The one truth for all derivatives: differences of unbatched calls, away from any kink."""
+    batch = parameters()
+    np.testing.assert_allclose(
+        loop(jax.jacfwd(outcome), batch), finite_differences(outcome, batch), rtol=2e-6, atol=2e-7
+    )
+    assert np.abs(finite_differences(outcome, batch)).max() > 0.1
+
+
+FIRST_ORDER = {
+    "vmap(jacfwd)": (lambda: jax.vmap(jax.jacfwd(outcome)), np.asarray),
+    "vmap(jacrev)": (lambda: jax.vmap(jax.jacrev(outcome)), np.asarray),
+    "jacfwd(vmap)": (lambda: jax.jacfwd(jax.vmap(outcome)), diagonal),
+    "jacrev(vmap)": (lambda: jax.jacrev(jax.vmap(outcome)), diagonal),
+}
+
+
+@pytest.mark.parametrize("name", FIRST_ORDER)
+def test_jacobians(float64, name):
+    transform, arrange = FIRST_ORDER[name]
+    batch = parameters()
+    measured = arrange(jax.jit(transform())(batch))
+    np.testing.assert_allclose(measured, loop(jax.jacfwd(outcome), batch), rtol=1e-9, atol=1e-10)
+
+
+GRADIENTS = {
+    "vmap(grad)": lambda: jax.vmap(jax.grad(cost)),
+    "grad(vmap)": lambda: jax.grad(lambda batch: jnp.sum(jax.vmap(cost)(batch))),
+    "vmap(grad(checkpoint))": lambda: jax.vmap(jax.grad(jax.checkpoint(cost))),
+    "grad(scan(vmap))": lambda: jax.grad(lambda batch: jnp.sum(jnp.sin(scan_of_vmap(batch)))),
+    "vmap(vmap(grad))": lambda: lambda batch: jax.vmap(jax.vmap(jax.grad(cost)))(batch[None])[0],
+}
+
+
+def scan_of_vmap(batch):
+    models, states, actions = jax.vmap(apply)(batch)
+    final, _ = jax.lax.scan(lambda s, _: (jax.vmap(step)(models, s, actions), None), states, None, length=STEPS)
+    leaves = (final.position[:, 1], final.velocity[:, 1], final.angular_velocity[:, 1], final.velocity[:, 2])
+    return jnp.concatenate(leaves, axis=-1)
+
+
+@pytest.mark.parametrize("name", GRADIENTS)
+def test_gradients(float64, name):
+    batch = parameters()
+    measured = jax.jit(GRADIENTS[name]())(batch)
+    np.testing.assert_allclose(measured, loop(jax.grad(cost), batch), rtol=1e-9, atol=1e-10)
+
+
+def test_hessian(float64):
+    batch = parameters()
+    measured = np.asarray(jax.jit(jax.vmap(jax.hessian(cost)))(batch))
+    truth = finite_differences(jax.grad(cost), batch)
+    np.testing.assert_allclose(measured, truth, rtol=1e-4, atol=1e-5 * np.abs(truth).max())
+
+
+VALUES = {
+    "vmap": lambda: jax.vmap(outcome),
+    "vmap(vmap)": lambda: lambda batch: jax.vmap(jax.vmap(outcome))(batch[None])[0],
+    "vmap(checkpoint)": lambda: jax.vmap(jax.checkpoint(outcome)),
+    "scan(vmap)": lambda: scan_of_vmap,
+    "vmap(jvp)": lambda: lambda batch: jax.vmap(lambda p: jax.jvp(outcome, (p,), (p,))[0])(batch),
+}
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_values(float64, name):
+    batch = parameters()
+    measured = jax.jit(VALUES[name]())(batch)
+    np.testing.assert_allclose(measured, loop(outcome, batch), rtol=1e-11, atol=1e-12)
+
+
+def worlds():
+    pairs = [apply(one) for one in parameters()]
+    return [[pair[index] for pair in pairs] for index in range(3)]
+
+
+def assert_states_equal(measured, truth):
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(measured), jax.tree.leaves(truth), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.mark.parametrize("jit", [False, True], ids=["eager", "jit"])
+@pytest.mark.parametrize("mapped", ["all", "model shared", "action shared", "state shared", "no action"])
+def test_shared_arguments(float64, mapped, jit):
+    """Any of model, state and action may be shared by the worlds."""
+    models, states, actions = worlds()
+    shared = {"model shared": 0, "state shared": 1, "action shared": 2}.get(mapped)
+    lists = [models, states, actions]
+    axes = [0, 0, 0]
+    if shared is not None:
+        lists[shared] = [lists[shared][0]] * WORLDS
+        axes[shared] = None
+    if mapped == "no action":
+        lists, axes = lists[:2], axes[:2]
+    batch = [items[0] if axis is None else stack(items) for items, axis in zip(lists, axes, strict=True)]
+    mapped_step = jax.vmap(step, in_axes=tuple(axes))
+    measured = (jax.jit(mapped_step) if jit else mapped_step)(*batch)
+    truth = stack([step(*one) for one in zip(*lists, strict=True)])
+    assert_states_equal(measured, truth)
+
+
+def test_one_mapped_leaf_of_the_model(float64):
+    """`in_axes` may name a single leaf, the others being shared."""
+    models, states, actions = worlds()
+    frictions = jnp.stack([model.friction for model in models])
+    base = models[0]
+    axes = dataclasses.replace(jax.tree.map(lambda _: None, base), friction=0)
+    batched = dataclasses.replace(base, friction=frictions)
+    measured = jax.vmap(step, in_axes=(axes, 0, 0))(batched, stack(states), stack(actions))
+    truth = [
+        step(dataclasses.replace(base, friction=f), s, a) for f, s, a in zip(frictions, states, actions, strict=True)
+    ]
+    assert_states_equal(measured, stack(truth))
+
+
+def test_worlds_along_another_axis(float64):
+    models, states, actions = worlds()
+    truth = stack([step(*one) for one in zip(models, states, actions, strict=True)])
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (stack(models), stack(states), stack(actions)))
+    measured = jax.vmap(step, in_axes=-1, out_axes=-1)(*last)
+    assert_states_equal(jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), measured), truth)
+
+
+def test_nested_maps_over_models_and_states(float64):
+    """Every model with every state: two mapped axes that belong to different arguments."""
+    models, states, actions = worlds()
+    inner = jax.vmap(step, in_axes=(None, 0, None))
+    measured = jax.jit(jax.vmap(inner, in_axes=(0, None, None)))(stack(models), stack(states), actions[0])
+    truth = stack([stack([step(model, state, actions[0]) for state in states]) for model in models])
+    assert_states_equal(measured, truth)
+
+
+def test_rollout_inside_and_outside_the_map(float64):
+    models, states, actions = worlds()
+    sequences = [jnp.broadcast_to(action, (STEPS, 1)) for action in actions]
+    final, trajectory = jax.jit(jax.vmap(rollout))(stack(models), stack(states), stack(sequences))
+    truth = [rollout(*one) for one in zip(models, states, sequences, strict=True)]
+    assert_states_equal(final, stack([one[0] for one in truth]))
+    assert_states_equal(trajectory, stack([one[1] for one in truth]))
+    stepped = states[0]
+    for _ in range(STEPS):
+        stepped = step(models[0], stepped, actions[0])
+    assert_states_equal(truth[0][0], stepped)
+    assert_states_equal(jax.tree.map(lambda leaf: leaf[-1], truth[0][1]), stepped)
+
+
+def test_batch_of_one_and_bitwise_repeatability(precision):
+    models, states, actions = worlds()
+    one = jax.jit(jax.vmap(step))(stack(models[:1]), stack(states[:1]), stack(actions[:1]))
+    again = jax.jit(jax.vmap(step))(stack(models[:1]), stack(states[:1]), stack(actions[:1]))
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)

@@ -1,0 +1,38 @@
+"""Defaults are the documented ones, and each silent extra can be switched off (benchmark M5)."""
+
+import dataclasses
+
+import pytest
+
+from mathota_jax import Options
+
+DEFAULTS = {
+    "dt": 1 / 60,
+    "velocity_iterations": 10,
+    "position_iterations": 3,
+    "linear_damping": 0.01,
+    "angular_damping": 0.05,
+    "slop": 0.005,
+    "position_percent": 0.8,
+    "baumgarte": 0.1,
+    "warm_start": True,
+}
+OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}
+
+
+def test_defaults():
+    options = Options()
+    for name, value in DEFAULTS.items():
+        assert getattr(options, name) == value, name
+
+
+@pytest.mark.parametrize("name", OFF)
+def test_every_extra_can_be_zero(name):
+    assert getattr(Options(**{name: OFF[name]}), name) == 0
+
+
+def test_options_are_frozen_hashable_and_comparable():
+    assert Options(dt=0.01) == Options(dt=0.01) != Options(dt=0.02)
+    assert hash(Options()) == hash(Options())
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Options().dt = 0.1
