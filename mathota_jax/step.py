@@ -30,7 +30,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import take
-from mathota_jax.spatial.settle import compute_once, opaque_one
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import Flag, State
 
@@ -116,20 +116,19 @@ class _Problem(NamedTuple):
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
     """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this."""
     scene = model.scene
-    one = opaque_one(model.dt, model.dt.dtype)
-    bodies = compute_once(unpack(state), one)
+    bodies = compute_once(unpack(state), state.position)
     if not scene.dynamic_bodies:
         return _finish(scene, state, bodies, bodies, None, None)
     blocks = moving(scene, bodies)
-    inertia = compute_once(moving_inertia(scene, model, blocks.orientation), one)
+    inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     force, torque = _external(model, state, bodies, action)
-    free, decay = compute_once(_free(model, blocks, inertia, force, torque), one)
+    free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = _constrain(model, state, bodies, blocks, inertia, free)
     start = _warm_start(model, state, problem)
     solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
     lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
-    moved, displacement = compute_once((moved, displacement), one)
+    moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
     return _finish(scene, state, bodies, moved, *_forces(model, problem, impulses))
 
@@ -181,11 +180,11 @@ def _constrain(
         )
     contacts, contact_rows = None, []
     if scene.pair_groups:
-        one = opaque_one(model.dt, model.dt.dtype)
         contacts = find_contacts(scene, model.shapes, bodies.position, bodies.orientation)
         contacts = contacts._replace(
             **compute_once(
-                {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation}, one
+                {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation},
+                state.position,
             )
         )
         motion = contact.Motion(
@@ -300,7 +299,7 @@ def _finish(
     scene: Scene, state: State, bodies: Bodies, moved: Bodies, joint_force: Array | None, contact_force: Any
 ) -> State:
     """The new state with its flags."""
-    merged = _merge(scene, bodies, compute_once(moved, opaque_one(moved.position.x, moved.position.x.dtype)))
+    merged = _merge(scene, bodies, compute_once(moved, moved.position.x))
     position, orientation, velocity, angular_velocity = (
         jnp.stack(list(components), axis=1)
         for components in (merged.position, merged.orientation, merged.velocity, merged.angular_velocity)

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from mathota_envs import make
-from mathota_envs.worlds import start_worlds, step_worlds
+from mathota_envs.worlds import start_worlds, step_then_restart
 from training.policies import Policy, load_policy
 from training.presets import require_whole_number
 
@@ -27,8 +27,8 @@ class Evaluation:
         returns: ``(episode,)`` undiscounted return of each.
         lengths: ``(episode,)`` steps of each.
         terminated: ``(episode,)`` True where the episode ended by itself, not by the time limit.
-        trajectory: Environment states of the first episode, the start included; leaves ``(time, ...)``. None unless
-            recorded.
+        trajectory: Environment states of the first episode before each of its steps; leaves ``(time, ...)``. None
+            unless recorded.
     """
 
     returns: np.ndarray
@@ -89,16 +89,17 @@ class Evaluator:
         lengths = np.zeros(self.episode_count, int)
         terminations = np.zeros(self.episode_count, bool)
         running = np.ones(self.episode_count, bool)
-        recorded = [_first_world(worlds.env_state)] if record else []
+        recorded = []
         for _ in range(self._environment.max_episode_steps):
+            if record and running[0]:
+                recorded.append(_first_world(worlds.env_state))
             actions = act(np.asarray(worlds.observation))
-            worlds, transition = step_worlds(self._environment, worlds, actions)
+            # The same program as in SB3VecEnv: with as many worlds as in training nothing is compiled again.
+            worlds, transition = step_then_restart(self._environment, worlds, actions)
             terminated = np.asarray(transition.terminated)
             returns += np.where(running, np.asarray(transition.reward), 0.0)
             lengths += running
             terminations |= running & terminated
-            if record and running[0]:
-                recorded.append(_first_world(worlds.env_state))
             running &= ~(terminated | np.asarray(transition.truncated))
             if not running.any():
                 break

@@ -54,6 +54,7 @@ def save_learning_curve(
     if target_return is not None:
         axes.axhline(target_return, color="black", linestyle="--", linewidth=1, label=f"target {target_return:g}")
     axes.set(title=title, xlabel="world-steps", ylabel="return of an episode")
+    axes.set_xlim(left=0)
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:

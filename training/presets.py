@@ -89,7 +89,15 @@ def require_whole_number(name: str, value: object, minimum: int) -> None:
         raise ValueError(f"{name} must be a whole number of at least {minimum}, got {value!r}")
 
 
-PRESETS: dict[tuple[str, str], Hyperparameters] = {}
+# As many worlds as evaluation episodes, so that backend sb3 trains and evaluates with one compiled program.
+_INVERTED_PENDULUM = Hyperparameters(
+    worlds=20, steps=200_000, samples_per_update=2000, minibatch_count=20, epochs=10, evaluations=100
+)
+
+PRESETS: dict[tuple[str, str], Hyperparameters] = {
+    ("mathota/InvertedPendulum-v0", "sb3"): _INVERTED_PENDULUM,
+    ("mathota/InvertedPendulum-v0", "jax"): _INVERTED_PENDULUM,
+}
 
 
 def preset(environment_id: str, backend: str) -> Hyperparameters:

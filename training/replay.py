@@ -45,8 +45,9 @@ def write_replay(
             that is not finite is hidden in those frames.
         dt: Time between two frames [s].
         contacts: Contact slots by frame, as an object or a mapping, or None: ``position (T, slot, 3)`` [m] and
-            ``normal (T, slot, 3)``; optionally ``active (T, slot)`` (default: all) and ``force`` [N], either the
-            magnitude along the normal ``(T, slot)`` or the vector ``(T, slot, 3)``.
+            ``normal (T, slot, 3)``; optionally ``active (T, slot)`` (default: all), ``force`` [N], either the
+            magnitude along the normal ``(T, slot)`` or the vector ``(T, slot, 3)``, and ``separation (T, slot)`` [m].
+            Active slots are shown that carry a force or are closer than 1 % of the smallest shape's bounding radius.
         title: Heading of the page.
 
     Raises:
@@ -94,6 +95,7 @@ def replay_data(model: Any, trajectory: Any, dt: float, contacts: Any = None, ti
     centre, radius = bounding_sphere(description, position)
     right, up, front = view_basis(model)
     distance = radius / math.sin(0.5 * DEFAULT_FIELD_OF_VIEW)
+    touching = 0.01 * min((shape["bounding_radius"] for shape in description), default=math.inf)
     return {
         "title": title,
         "dt": float(dt),
@@ -111,7 +113,7 @@ def replay_data(model: Any, trajectory: Any, dt: float, contacts: Any = None, ti
         "shapes": [_json_shape(shape) for shape in description],
         "position": _encoded(position),
         "orientation": _encoded(orientation),
-        "contacts": None if contacts is None else _contact_data(contacts, position.shape[0]),
+        "contacts": None if contacts is None else _contact_data(contacts, position.shape[0], touching),
     }
 
 
@@ -122,8 +124,11 @@ def _json_shape(shape: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in named.items() if value != math.inf}
 
 
-def _contact_data(contacts: Any, frame_count: int) -> dict[str, str]:
-    """Active contacts only, frame after frame: how many a frame has, and flat lists of points, normals and forces."""
+def _contact_data(contacts: Any, frame_count: int, touching: float) -> dict[str, str]:
+    """Shown contacts only, frame after frame: how many a frame has, and flat lists of points, normals and forces.
+
+    An engine also lists pairs about to touch; those that are further apart than `touching` [m] are left out.
+    """
     position = np.asarray(_field(contacts, "position"), dtype=np.float32)
     if position.ndim != 3 or position.shape[0] != frame_count or position.shape[2] != 3:
         raise ValueError(f"contacts.position must have shape ({frame_count}, slot, 3), got {position.shape}")
@@ -139,8 +144,12 @@ def _contact_data(contacts: Any, frame_count: int) -> dict[str, str]:
         force = force[..., None] * normal
     if force.shape != (*slots, 3):
         raise ValueError(f"contacts.force must have shape {slots} or {(*slots, 3)}, got {force.shape}")
+    separation = np.asarray(_field(contacts, "separation", np.zeros(slots)))
+    if separation.shape != slots:
+        raise ValueError(f"contacts.separation must have shape {slots}, got {separation.shape}")
+    met = (separation <= touching) | (force != 0).any(-1)
     finite = np.isfinite(position).all(-1) & np.isfinite(normal).all(-1) & np.isfinite(force).all(-1)
-    shown = active & finite
+    shown = active & met & finite
     return {
         "count": _encoded(shown.sum(axis=1), "<u4"),
         "position": _encoded(position[shown]),

@@ -169,7 +169,9 @@ def print_result(result: Result) -> None:
         f"trained {result.metrics['steps']} steps in {result.metrics['training_seconds']:.1f} s "
         f"({result.metrics['steps_per_second']:.0f} steps/s, compilation and evaluations included)"
     )
-    print(f"evaluation: {result.evaluation}")
+    if result.metrics["target_reached_in_training"]:
+        print(f"stopped early: an evaluation reached the target {result.metrics['target_return']:g}")
+    print(f"final evaluation: {result.evaluation}")
     print("outputs:")
     for path in sorted(result.folder.iterdir()):
         print(f"  {path}")

@@ -86,7 +86,7 @@ class BallBalance(SimulatedEnvironment):
         builder.add_body(Sphere(BALL_RADIUS), mass=0.1, position=above, friction=0.9, name="ball")
         for joint, name in ((TILT_X, "tilt x"), (TILT_Z, "tilt z")):
             builder.add_motor(builder.add_joint(joint, name=name), kind="torque", limit=1.0, gear=0.5)
-        return builder.build(Options(dt=self.time_step))
+        return builder.build(Options(dt=self.engine_step))
 
     def start(self, key: Array, options: dict[str, Array]) -> tuple[State, Any]:
         """Ball at rest on the tilted plate, target somewhere on its course."""

@@ -71,8 +71,8 @@ def view_basis(model: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     up = -np.asarray(model.gravity, dtype=float)
     if not np.linalg.norm(up) > 0:
-        planes = [shape for shape in model.scene.shapes if shape.kind == "plane"]
-        up = np.asarray(model.shapes["plane"]["normal"], float)[planes[0].index] if planes else np.array([0.0, 1.0, 0.0])
+        planes = [shape for shape in scene_description(model) if shape["kind"] == "plane"]
+        up = np.array(planes[0]["normal"] if planes else (0.0, 1.0, 0.0))
     up = up / np.linalg.norm(up)
     along_x = np.array([1.0, 0.0, 0.0])
     right = along_x if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])

@@ -86,4 +86,6 @@ def require_world_count(world_count: Any) -> int:
 def require_render_mode(render_mode: str | None, modes: Sequence[str]) -> None:
     """Raises ValueError unless the render mode is None or among the modes."""
     if render_mode is not None and render_mode not in modes:
-        raise ValueError(f"unknown render_mode {render_mode!r}; valid: {', '.join([repr(m) for m in modes] + ['None'])}")
+        raise ValueError(
+            f"unknown render_mode {render_mode!r}; valid: {', '.join([repr(m) for m in modes] + ['None'])}"
+        )

@@ -51,6 +51,7 @@ class InvertedPendulum(SimulatedEnvironment):
     """
 
     frame_skip: int = 2
+    substeps: int = 2
     reset_noise_scale: float = 0.01
 
     time_step: ClassVar[float] = 0.02
@@ -82,7 +83,7 @@ class InvertedPendulum(SimulatedEnvironment):
         builder.add_joint(HINGE, name="hinge")
         builder.add_motor(slider, kind="torque", limit=3.0, gear=100.0)
         # The dampings of the free bodies are off: Gymnasium's model damps the joints only.
-        return builder.build(Options(dt=self.time_step, linear_damping=0.0, angular_damping=0.0))
+        return builder.build(Options(dt=self.engine_step, linear_damping=0.0, angular_damping=0.0))
 
     def start(self, key: Array, options: dict[str, Array]) -> tuple[State, Any]:
         """Random joint coordinates and rates, or those of the options."""

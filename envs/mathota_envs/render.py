@@ -24,8 +24,8 @@ from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basi
 
 HORIZON_COLOUR = (0.80, 0.86, 0.91)
 ZENITH_COLOUR = (0.36, 0.55, 0.78)
-LIGHT_TILT = (0.45, 0.35)
-"""Horizontal parts of the direction to the light, along the two tangents of up, relative to the vertical part."""
+LIGHT_TILT = (0.45, 0.55)
+"""Direction to the light along right and front (see `camera.view_basis`), relative to its part along up."""
 
 
 class _Shape(NamedTuple):
@@ -54,9 +54,7 @@ class _Surface(NamedTuple):
     haze: Array
 
 
-def render_rgb(
-    model: Any, state: Any, width: int = 480, height: int = 360, camera: Camera | None = None
-) -> np.ndarray:
+def render_rgb(model: Any, state: Any, width: int = 480, height: int = 360, camera: Camera | None = None) -> np.ndarray:
     """Picture of one state.
 
     Args:
@@ -121,8 +119,7 @@ def _render(
 ) -> Array:
     groups = _groups(shapes, sizes, position, orientation)
     up = _up(gravity, groups)
-    tangents = tangent_basis(up)
-    light = normalize(up + tangents[0] * LIGHT_TILT[0] + tangents[1] * LIGHT_TILT[1])
+    light = _light(up)
     eye = _vector(camera.position)
     ray, pixel_angle = _primary_rays(camera, width, height)
     sky = _sky(dot(ray, up))
@@ -182,6 +179,14 @@ def _up(gravity: Array, groups: list[_Group]) -> Vec3:
     return normalize(where(dot(down, down) > 0, -down, fallback))
 
 
+def _light(up: Vec3) -> Vec3:
+    """Unit direction to the light: from above, to the right and before the default viewer."""
+    one, zero = jnp.ones_like(up.x), jnp.zeros_like(up.x)
+    reference = where(jnp.abs(up.x) < 0.9, Vec3(one, zero, zero), Vec3(zero, one, zero))
+    right = normalize(reference - up * dot(reference, up))
+    return normalize(up + right * LIGHT_TILT[0] + cross(right, up) * LIGHT_TILT[1])
+
+
 def _primary_rays(camera: Camera, width: int, height: int) -> tuple[Vec3, Array]:
     """Unit directions through the pixel centres, row by row from the top, and the angle [rad] of a pixel."""
     forward = normalize(_vector(camera.target - camera.position))
@@ -220,7 +225,7 @@ def _first_hit(groups: list[_Group], eye: Vec3, ray: Vec3, pixel_angle: Array, v
                 colour = colour * _chequer(point, placed, cell, footprint)
                 haze = 1.0 - 1.0 / (1.0 + (distance / (12.0 * view_distance)) ** 2)
             elif shape.patterned:
-                colour = colour * _octants(normal, placed)
+                colour = colour * _octants(point, placed)
             return _Surface(
                 jnp.where(closer, distance, nearest.distance),
                 where(closer, normal, nearest.normal),
@@ -232,9 +237,9 @@ def _first_hit(groups: list[_Group], eye: Vec3, ray: Vec3, pixel_angle: Array, v
     return nearest
 
 
-def _octants(normal: Vec3, placed: Placed) -> Array:
+def _octants(point: Vec3, placed: Placed) -> Array:
     """Brightness of the eight octants of a round shape in turns light and dark, so that its rotation shows."""
-    local = placed.rotation.apply_transposed(normal)
+    local = placed.rotation.apply_transposed(point - placed.position)
     return jnp.where(local.x * local.y * local.z > 0, 1.0, 0.6)
 
 

@@ -23,7 +23,6 @@ from mathota_envs.frames import FrameMaker
 from mathota_envs.host import (
     checked_actions,
     checked_reset_options,
-    entropy_words,
     require_render_mode,
     require_world_count,
     seed_entropy,
@@ -104,7 +103,9 @@ class SB3VecEnv(VecEnv):
             mask = np.array([single is not None and tuple(sorted(single)) == names for single in options])
             template = options[int(np.argmax(mask))]
             stacked = {
-                name: jnp.stack([(single if chosen else template)[name] for single, chosen in zip(options, mask, strict=True)])
+                name: jnp.stack(
+                    [(single if chosen else template)[name] for single, chosen in zip(options, mask, strict=True)]
+                )
                 for name in names
             }
             self.worlds = restart_worlds(self.environment, self.worlds, mask, key, stacked)
@@ -166,7 +167,7 @@ class SB3VecEnv(VecEnv):
             RuntimeError: `reset` was never called.
         """
         if self.render_mode != "rgb_array":
-            warnings.warn('get_images draws nothing: the environment was made without render_mode="rgb_array"')
+            warnings.warn('no pictures: the environment was made without render_mode="rgb_array"', stacklevel=2)
             return [None] * self.num_envs
         return self._images(range(self.num_envs))
 

@@ -76,7 +76,7 @@ def scene_description(model: Any) -> list[dict[str, Any]]:
 
 
 def foreground(description: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Shapes that a view should frame: the bounded ones, less those far larger than the rest (a floor made of a box)."""
+    """Shapes that a view should frame: the bounded ones, less those far larger than the rest (a floor as a box)."""
     bounded = [shape for shape in description if math.isfinite(shape["bounding_radius"])]
     if not bounded:
         return []

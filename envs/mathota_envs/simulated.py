@@ -27,14 +27,16 @@ class SimulatedEnvironment(Environment):
     spread to every weight. The other worlds do not notice.
 
     Attributes:
-        frame_skip: simulation steps in one control step, all under the same action.
-        time_step: simulated time of one of them [s].
+        frame_skip: time steps in one control step, all under the same action.
+        substeps: steps of the engine in one time step: more are more accurate and slower.
+        time_step: duration of a time step [s].
         observation_size: entries of the observation.
         action_limit: largest magnitude of each entry of the action.
         rest_state: state of the scene as built.
     """
 
     frame_skip: int = 1
+    substeps: int = 1
 
     time_step: ClassVar[float]
     observation_size: ClassVar[int]
@@ -44,6 +46,7 @@ class SimulatedEnvironment(Environment):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_whole_number("frame_skip", minimum=1)
+        self.require_whole_number("substeps", minimum=1)
         # An environment may be made while another function is traced; its model must not keep that trace's values.
         with jax.ensure_compile_time_eval():
             model, rest_state = self.build()
@@ -58,9 +61,14 @@ class SimulatedEnvironment(Environment):
             action_space=Box(-limit, limit, dtype=np.float32),
         )
 
+    @property
+    def engine_step(self) -> float:
+        """Duration of one step of the engine [s]."""
+        return self.time_step / self.substeps
+
     @abc.abstractmethod
     def build(self) -> tuple[Model, State]:
-        """The scene."""
+        """The scene, with the engine's step of `engine_step` seconds."""
 
     @abc.abstractmethod
     def start(self, key: Array, options: dict[str, Array]) -> tuple[State, Any]:
@@ -87,9 +95,8 @@ class SimulatedEnvironment(Environment):
         """See `Environment.step`."""
         model = self.model if model is None else model
         action = self.checked_action(action)
-        state, _ = lax.scan(
-            lambda state, _: (step(model, state, action), None), env_state.state, None, length=self.frame_skip
-        )
+        length = self.frame_skip * self.substeps
+        state, _ = lax.scan(lambda state, _: (step(model, state, action), None), env_state.state, None, length=length)
         env_state = dataclasses.replace(env_state, state=state, step_count=env_state.step_count + 1)
         raw_observation = self.observe(model, env_state)
         finite = jnp.isfinite(raw_observation)

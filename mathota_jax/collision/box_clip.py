@@ -20,7 +20,8 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.collision.box_frame import BoxFrame
-from mathota_jax.spatial.settle import compute_once, opaque_one, settle_code
+from mathota_jax.collision.closest import clamp
+from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3
 
 RECTANGLE_TOLERANCE = 1e-3
@@ -72,21 +73,30 @@ def clip_incident_face(frame: BoxFrame, size: Array) -> tuple[ClipPoint, ...]:
         half_v=frame.half.y,
     )
     size = lax.stop_gradient(size)
-    one = opaque_one(frame.incident_axis, size.dtype)
-    face = compute_once(face, one)
+    face = compute_once(face, frame.incident_axis)
     candidates = _candidates(lax.stop_gradient(face), frame.edge, RECTANGLE_TOLERANCE * size)
-    candidates = [_Candidates(*compute_once((c.u, c.v, c.w, c.code), one)) for c in candidates]
+    candidates = [_Candidates(*compute_once((c.u, c.v, c.w, c.code), frame.incident_axis)) for c in candidates]
     merge = MERGE_DISTANCE * size
 
-    first = _point(face, _winner([LEAN * (c.u + 0.5 * c.v) - c.w for c in candidates], candidates, None))
-    u0, v0 = lax.stop_gradient((first.u, first.v))
-    second = _point(face, _winner([(c.u - u0) ** 2 + (c.v - v0) ** 2 for c in candidates], candidates, merge * merge))
-    du, dv = lax.stop_gradient(second.u) - u0, lax.stop_gradient(second.v) - v0
-    least_area = merge * jnp.maximum(jnp.abs(du), jnp.abs(dv))
-    areas = [du * (c.v - v0) - dv * (c.u - u0) for c in candidates]
-    third = _point(face, _winner(areas, candidates, least_area))
-    fourth = _point(face, _winner([-area for area in areas], candidates, least_area))
-    return first, second, third, fourth
+    first = _winner([LEAN * (c.u + 0.5 * c.v) - c.w for c in candidates], candidates, jnp.finfo(size.dtype).min)
+    u0, v0 = _coordinates(first, candidates)
+    distances = [(c.u - u0) ** 2 + (c.v - v0) ** 2 for c in candidates]
+    second = _winner(distances, candidates, merge * merge)
+    u1, v1 = _coordinates(second, candidates)
+    areas = [_area(u0, v0, u1, v1, c) for c in candidates]
+    least_area = merge * jnp.maximum(jnp.abs(u1 - u0), jnp.abs(v1 - v0))
+    # On an edge parallel to the first two all areas are equal: lean again.
+    spans = [jnp.abs(area) + LEAN * distance for area, distance in zip(areas, distances, strict=True)]
+    third = _winner(spans, candidates, jnp.where(second < 0, jnp.inf, least_area))
+    u2, v2 = _coordinates(third, candidates)
+    # The fourth adds the largest triangle outside one of the three sides.
+    turn = jnp.where((u1 - u0) * (v2 - v0) - (v1 - v0) * (u2 - u0) < 0, 1.0, -1.0).astype(size.dtype)
+    added = [
+        jnp.maximum(turn * area, jnp.maximum(turn * _area(u1, v1, u2, v2, c), turn * _area(u2, v2, u0, v0, c)))
+        for area, c in zip(areas, candidates, strict=True)
+    ]
+    fourth = _winner(added, candidates, jnp.where(third < 0, jnp.inf, least_area))
+    return tuple(_point(face, code) for code in (first, second, third, fourth))
 
 
 class _Candidates(NamedTuple):
@@ -163,7 +173,7 @@ def _reciprocal(value: Array, scale: Array) -> Array:
     return 1.0 / jnp.where(jnp.abs(value) > tiny, value, jnp.where(value < 0, -tiny, tiny))
 
 
-def _winner(scores: list[Array], candidates: list[_Candidates], threshold: Array | None) -> Array:
+def _winner(scores: list[Array], candidates: list[_Candidates], threshold: Array | float) -> Array:
     """Settled code of the valid candidate of the highest score above the threshold, -1 where there is none."""
     lowest = jnp.finfo(scores[0].dtype).min
     best, code = jnp.where(candidates[0].code >= 0, scores[0], lowest), candidates[0].code
@@ -172,7 +182,20 @@ def _winner(scores: list[Array], candidates: list[_Candidates], threshold: Array
         best, code = jnp.where(better, score, best), jnp.where(better, candidate.code, code)
     best, code = _better(best[:2], code[:2], best[2:], code[2:])
     best, code = _better(best[0], code[0], best[1], code[1])
-    return settle_code(jnp.where(best > (lowest if threshold is None else threshold), code, -1.0))
+    return settle_code(jnp.where(best > threshold, code, -1.0))
+
+
+def _coordinates(code: Array, candidates: list[_Candidates]) -> tuple[Array, Array]:
+    """(u, v) of the candidate with this code (finite and meaningless for an empty slot)."""
+    wanted = code.astype(candidates[0].code.dtype)
+    u = sum(jnp.where(c.code == wanted, c.u, 0.0) for c in candidates)
+    v = sum(jnp.where(c.code == wanted, c.v, 0.0) for c in candidates)
+    return u[0] + u[1] + u[2] + u[3], v[0] + v[1] + v[2] + v[3]
+
+
+def _area(u0: Array, v0: Array, u1: Array, v1: Array, c: _Candidates) -> Array:
+    """Twice the signed area of the triangle of two points and each candidate."""
+    return (u1 - u0) * (c.v - v0) - (v1 - v0) * (c.u - u0)
 
 
 def _better(best: Array, code: Array, other: Array, other_code: Array) -> tuple[Array, Array]:
@@ -214,7 +237,7 @@ def _point(face: _Face, code: Array) -> ClipPoint:
     # Walking inward from an end one enters through the side one comes from.
     line = -jnp.sign(lax.stop_gradient(free)) * second * half
     walked = (line - center - first * fixed) / jnp.where(vertex | corner, 1.0, free)
-    walked = jnp.where(vertex, -second, jnp.clip(walked, -1.0, 1.0))
+    walked = jnp.where(vertex, -second, clamp(walked, -1.0, 1.0))
 
     alpha, beta = _solve(face, first * face.half_u - face.center.x, second * face.half_v - face.center.y, corner)
     alpha = jnp.where(corner, alpha, jnp.where(along_alpha, walked, first))

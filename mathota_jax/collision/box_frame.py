@@ -9,7 +9,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.box_axes import FIRST_EDGE
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.settle import compute_once, opaque_one, settle_code
+from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3
 
 
@@ -80,8 +80,7 @@ def box_frame(
     incident_code = _incident(row_w, edge, edge_index - 3 * edge_row)
     first = incident_code >> 1
     incident = Mat3(*(Vec3(*(_cyclic(first, shift, list(row)) for row in (row_u, row_v, row_w))) for shift in range(3)))
-    one = opaque_one(incident_code, t.x.dtype)
-    incident = compute_once(incident, one)
+    incident = compute_once(incident, incident_code)
     return BoxFrame(
         edge=edge,
         reference_b=reference_b,
@@ -91,7 +90,7 @@ def box_frame(
         incident_axis=first,
         incident_outward=incident_code & 1,
         origin=_pick(reference_b, pose_a.position, pose_b.position),
-        basis=compute_once(Mat3(axis_u, axis_v, axis_w * sign), one),
+        basis=compute_once(Mat3(axis_u, axis_v, axis_w * sign), incident_code),
         center=compute_once(
             Vec3(_cyclic(axis, 1, center), _cyclic(axis, 2, center), _cyclic(axis, 0, center) * sign), one
         ),

@@ -12,6 +12,20 @@ from mathota_jax.spatial.settle import settle
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis, where
 
 
+def clamp(value: Any, low: Any, high: Any) -> Array:
+    """`value` held in [low, high].
+
+    Unlike `jnp.clip`, whose derivative compares the result with its arguments for equality: if the compiler rounds a
+    recomputed argument differently (see `settle`) neither is equal and the derivative is lost.
+    """
+    return jnp.where(value < low, low, jnp.where(value > high, high, value))
+
+
+def clamp_to_box(point: Vec3, half: Vec3) -> Vec3:
+    """Point of the box ``|x_i| <= half_i`` closest to `point`."""
+    return Vec3(*(clamp(p, -h, h) for p, h in zip(point, half, strict=True)))
+
+
 def direction(difference: Vec3, fallback: Vec3, size: Any) -> Vec3:
     """Unit vector along `difference`, or the unit `fallback` where its length is round-off against `size`.
 
@@ -53,7 +67,7 @@ def round_point(
 
 def closest_on_segment(point: Vec3, center: Vec3, axis: Vec3, half_length: Any) -> Vec3:
     """Point of the segment ``center + t * axis``, ``|t| <= half_length`` (unit axis), that is closest to `point`."""
-    return center + axis * jnp.clip(dot(axis, point - center), -half_length, half_length)
+    return center + axis * clamp(dot(axis, point - center), -half_length, half_length)
 
 
 def closest_parameters(
@@ -74,9 +88,9 @@ def closest_parameters(
     line_a = (along_a - cosine * along_b) / jnp.where(parallel, 1.0, sine_squared)
     # (Nearly) parallel: the middle of the overlap of B's shadow on A.
     reach = half_length_b * jnp.abs(cosine)
-    low = jnp.clip(along_a - reach, -half_length_a, half_length_a)
-    high = jnp.clip(along_a + reach, -half_length_a, half_length_a)
-    a = jnp.where(parallel, 0.5 * (low + high), jnp.clip(line_a, -half_length_a, half_length_a))
-    b = jnp.clip(cosine * a - along_b, -half_length_b, half_length_b)
-    a = jnp.clip(cosine * b + along_a, -half_length_a, half_length_a)
+    low = clamp(along_a - reach, -half_length_a, half_length_a)
+    high = clamp(along_a + reach, -half_length_a, half_length_a)
+    a = jnp.where(parallel, 0.5 * (low + high), clamp(line_a, -half_length_a, half_length_a))
+    b = clamp(cosine * a - along_b, -half_length_b, half_length_b)
+    a = clamp(cosine * b + along_a, -half_length_a, half_length_a)
     return a, b

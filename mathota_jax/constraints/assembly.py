@@ -12,7 +12,6 @@ from jax import Array
 from mathota_jax.bodies import Inertia
 from mathota_jax.solver.table import EMPTY, Table
 from mathota_jax.spatial.indexing import take
-from mathota_jax.spatial.settle import compute_once, opaque_one
 from mathota_jax.spatial.vector import Vec3, dot
 
 
@@ -64,8 +63,7 @@ def pack_sides(table: Table, rows: Sequence[Side], worlds: int) -> Array:
 def pack_scalars(table: Table, values: Sequence[Array], worlds: int) -> Array:
     """(turn, row, column, world) from one (turn * column, world) array for each row; padding becomes 0."""
     turns, columns = table.turn_count, len(table.slots[0])
-    stored = [value if jnp.ndim(value) < 2 else compute_once(value, opaque_one(value, value.dtype)) for value in values]
-    full = [jnp.broadcast_to(value, (turns * columns, worlds)) for value in stored]
+    full = [jnp.broadcast_to(value, (turns * columns, worlds)) for value in values]
     if EMPTY in table.order:
         full = [jnp.where(table.order[:, None] == EMPTY, 0.0, value) for value in full]
     return jnp.stack([value.reshape(turns, columns, worlds) for value in full], axis=1)

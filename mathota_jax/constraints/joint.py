@@ -18,6 +18,7 @@ from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import Constraint, Table, make_tables
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 
 LARGEST_DECAY = 30.0
@@ -97,10 +98,14 @@ def joint_rows(model: Model, bodies: Bodies) -> JointRows:
         return Side(*(_stack_vectors([getattr(s, part) for s in sides], counts) for part in ("linear", "angular")))
 
     zero = jnp.zeros((1, 1), model.dt.dtype)
+    parent, child, error = compute_once(
+        (side("parent"), side("child"), _stack([row.error for row in rows], counts)),
+        bodies.position.x,
+    )
     return JointRows(
-        parent=side("parent"),
-        child=side("child"),
-        error=_stack([row.error for row in rows], counts),
+        parent=parent,
+        child=child,
+        error=error,
         damping=_stack([zero if row.damping is None else row.damping for row in rows], counts),
         one_sided=np.repeat([row.one_sided for row in rows], counts),
         damped=np.repeat([row.damping is not None for row in rows], counts),

@@ -9,7 +9,7 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia
 from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize
-from mathota_jax.spatial.settle import compute_once, opaque_one
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, cross, dot
 from mathota_jax.spatial.vector import multiply as componentwise
 
@@ -57,12 +57,11 @@ def rotate_at_constant_momentum(
         return omega + bracket * 0.5 + cross(theta, bracket) * (1.0 / 12.0)
 
     k1 = componentwise(inverse, start)
-    one = opaque_one(dt, dt.dtype)
-    k2 = compute_once(rate(k1 * (0.5 * dt)), one)
-    k3 = compute_once(rate(k2 * (0.5 * dt)), one)
+    k2 = compute_once(rate(k1 * (0.5 * dt)), start.x)
+    k3 = compute_once(rate(k2 * (0.5 * dt)), start.x)
     k4 = rate(k3 * dt)
     theta = (k1 + (k2 + k3) * 2.0 + k4) * (dt / 6.0)
-    theta = compute_once(theta, one)
+    theta = compute_once(theta, start.x)
     return normalize(multiply(orientation, exponential(theta))), theta
 
 

@@ -7,6 +7,7 @@ from jax import Array
 from mathota_jax.bodies import Bodies, Inertia, unpack_blocks
 from mathota_jax.dynamics.free_motion import rotate_at_constant_momentum
 from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize, to_matrix
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 
 
@@ -47,7 +48,9 @@ def advance(
     if solved_angular is not None and lever_angular is not None:
         end = end + inertia.apply(solved_angular - free_angular)
         mean = mean + inertia.apply(lever_angular) / dt
+    mean, end, shift = compute_once((mean, end, shift), bodies.position.x)
     orientation, turn = rotate_at_constant_momentum(bodies.orientation, inertia, mean, dt)
+    orientation = compute_once(orientation, bodies.position.x)
     if inertia.rotation is None:
         angular = inertia.solve(end)
     else:

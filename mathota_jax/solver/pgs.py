@@ -24,6 +24,7 @@ from jax import Array, lax
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.table import Table
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.struct import pytree, static
 
 UNROLLED_TURNS = 12
@@ -129,6 +130,8 @@ def _turn(update: Update, velocity: Array, blocks: tuple, receivers: object, val
     for side_jacobian, side_blocks in zip(jacobian, blocks, strict=True):
         error = error + _project(side_jacobian, _gather(velocity, side_blocks))
     new = update(coefficients, impulse, error)
+    # Stored, because every later row of the sweep depends on it: a chain of rows must not be computed again for each.
+    new = compute_once(new, new)
     return _receive(velocity, receivers, [_respond(side, new - impulse) for side in response]), new
 
 

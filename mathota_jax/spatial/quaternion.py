@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from mathota_jax.spatial.settle import compute_once, opaque_one
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Mat3, Vec3, dot
 
 
@@ -59,5 +59,5 @@ def exponential(rotation_vector: Vec3) -> Quaternion:
     sinc = jnp.where(small, 1.0 - quarter * (1.0 / 6.0 - quarter / 120.0), jnp.sin(half) / half)
     cosine = jnp.where(small, 1.0 - quarter * (0.5 - quarter / 24.0), jnp.cos(half))
     # Each serves several components; trigonometry is worth doing once.
-    scale, cosine = compute_once((0.5 * sinc, cosine), opaque_one(quarter, quarter.dtype))
+    scale, cosine = compute_once((0.5 * sinc, cosine), quarter)
     return Quaternion(cosine, rotation_vector.x * scale, rotation_vector.y * scale, rotation_vector.z * scale)

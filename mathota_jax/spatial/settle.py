@@ -28,20 +28,21 @@ def settle_code(decision: Array) -> Array:
     return settle(decision).astype(jnp.int32)
 
 
-def opaque_one(settled: Array, dtype: Any) -> Array:
-    """The number 1, of the shape of the finite array `settled`, which XLA cannot know to be 1."""
-    return settled.astype(dtype) * 0 + 1
-
-
-def compute_once(values: Any, one: Array) -> Any:
+def compute_once(values: Any, like: Array) -> Any:
     """Keeps XLA from recomputing each array of the pytree `values` in every kernel that uses it.
 
-    Values and derivatives are unchanged. Worth a division where an array is costly and has many consumers. An array with
-    one world is left alone: storing it would cost a kernel, computing it again costs nothing beside the others.
+    XLA copies cheap expressions into all their consumers, so that a rotation matrix is rebuilt in a hundred kernels and a
+    chain of n dependent rows costs 2^n. It never copies a division. Values and derivatives are unchanged.
 
     Args:
-        values: Pytree of floating-point arrays that broadcast with `one`.
-        one: Result of `opaque_one`.
+        values: Pytree of finite floating-point arrays.
+        like: Array whose last axis is that of the worlds. A value that all worlds share is left alone: storing it would
+            cost a kernel, while computing it again costs nothing beside what is done for each world.
     """
-    one = lax.stop_gradient(one)
-    return jax.tree.map(lambda value: value if jnp.shape(value)[-1:] in ((), (1,)) else value / one, values)
+    worlds = like.shape[-1]
+    return jax.tree.map(lambda value: value if worlds > 1 and jnp.shape(value)[-1:] in ((), (1,)) else _store(value), values)
+
+
+def _store(value: Array) -> Array:
+    # The divisor has the shape of the value: XLA turns a division by a broadcast scalar into a product, which it copies.
+    return value / (lax.stop_gradient(value) * 0 + 1)

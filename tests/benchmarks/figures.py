@@ -98,8 +98,8 @@ def _own_settings(own: dict) -> str:
     settings = own["settings"]
     contacts = own["error"]["mean_contacts"]
     return (
-        f"vmap(step) in a scan, {settings['batch']} worlds, dt 1/{1 / settings['dt']:.0f} s, {settings['sweeps']} sweeps, "
-        f"{settings['precision']}, {contacts:.2g} loaded contacts on average"
+        f"vmap(step) in a scan, {settings['batch']} worlds, dt 1/{1 / settings['dt']:.0f} s, {settings['sweeps']} "
+        f"sweeps, {settings['precision']}, {contacts:.2g} loaded contacts on average"
     )
 
 

@@ -2,8 +2,8 @@
 
 Slide is shown with the default solver and with projected Gauss-Seidel at our number of sweeps. MuJoCo's convex contact
 model lifts a fast sliding cube off the plane, so that most of its steps have no contact at all; therefore the resting
-cube with its four contacts is timed too. Bounce uses the direct stiffness and damping form of `solref`, with the damping
-ratio that gives the restitution in continuous time, at two stiffnesses.
+cube with its four contacts is timed too. Bounce uses the direct stiffness and damping form of `solref`, with the
+damping ratio that gives the restitution in continuous time, at two stiffnesses.
 """
 
 from __future__ import annotations
@@ -40,10 +40,13 @@ def slide_xml(dt: float, solver: str, cone: str, iterations: int) -> str:
     """MJCF of the sliding cube; lengths in m."""
     half, friction = scenes.SLIDE_HALF_EXTENT, f'friction="{scenes.SLIDE_FRICTION} 0 0"'
     return f"""<mujoco>
-      <option timestep="{dt}" gravity="0 0 -{scenes.GRAVITY}" solver="{solver}" cone="{cone}" iterations="{iterations}"/>
+      <option timestep="{dt}" gravity="0 0 -{scenes.GRAVITY}" solver="{solver}" cone="{cone}"
+              iterations="{iterations}"/>
       <worldbody>
         <geom type="plane" size="0 0 1" {friction}/>
-        <body pos="0 0 {half}"><freejoint/><geom type="box" size="{half} {half} {half}" mass="{scenes.MASS}" {friction}/></body>
+        <body pos="0 0 {half}">
+          <freejoint/><geom type="box" size="{half} {half} {half}" mass="{scenes.MASS}" {friction}/>
+        </body>
       </worldbody></mujoco>"""
 
 

@@ -16,8 +16,8 @@ def markdown(report: dict) -> str:
         "Written by `python -m tests.benchmarks`; do not edit. Every round is in `report.json`.",
         "",
         f"- Machine: {machine['processor']}, {machine['cores']} cores; {', '.join(_versions(machine))}",
-        f"- Run: {report['date']}, mode {settings['mode']}, {settings['rounds']} interleaved rounds of blocks of at least "
-        f"{settings['block_seconds']} CPU-seconds; figures are medians, ratios are taken within a round",
+        f"- Run: {report['date']}, mode {settings['mode']}, {settings['rounds']} interleaved rounds of blocks of at "
+        f"least {settings['block_seconds']} CPU-seconds; figures are medians, ratios are taken within a round",
         "- Rates are per CPU-second (`time.process_time`, all threads), after compilation and warm-up; compile time is "
         "measured apart",
     ]

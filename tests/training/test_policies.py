@@ -67,7 +67,7 @@ def test_evaluation_of_a_known_episode(terminates):
     np.testing.assert_array_equal(evaluation.returns, [7, 7, 7])
     np.testing.assert_array_equal(evaluation.lengths, [7, 7, 7])
     assert evaluation.terminated.tolist() == [terminates] * 3
-    np.testing.assert_array_equal(evaluation.trajectory.step_count, range(8))
+    np.testing.assert_array_equal(evaluation.trajectory.step_count, range(7))
 
 
 def test_evaluation_counts_nothing_after_the_end():
@@ -76,7 +76,7 @@ def test_evaluation_counts_nothing_after_the_end():
     # The reward is 1 for each step but the one at which the pole falls, and the pole falls at different times.
     np.testing.assert_array_equal(evaluation.returns, evaluation.lengths - 1)
     assert len(set(evaluation.lengths)) > 1
-    assert len(evaluation.trajectory.step_count) == evaluation.lengths[0] + 1
+    np.testing.assert_array_equal(evaluation.trajectory.step_count, range(evaluation.lengths[0]))
     again, other = (evaluator.run(lambda _: np.zeros((10, 1)), seed=seed).lengths for seed in (0, 1))
     np.testing.assert_array_equal(evaluation.lengths, again)
     assert list(other) != list(again)

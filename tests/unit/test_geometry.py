@@ -1,7 +1,10 @@
 """Shapes: validation and mass properties against quadrature that does not use their formulas."""
 
+import itertools
+
 import numpy as np
 import pytest
+
 from mathota_jax.geometry import SHAPES, Box, Capsule, Plane, Sphere
 
 EXAMPLES = {
@@ -31,7 +34,7 @@ def _quadrature(shape):
         reach, breaks = shape.radius, [-shape.radius, shape.radius]
     nodes, weights = np.polynomial.legendre.leggauss(40)
     volume = about_y = about_x = about_z = 0.0
-    for low, high in zip(breaks[:-1], breaks[1:], strict=True):
+    for low, high in itertools.pairwise(breaks):
         y = 0.5 * (high + low) + 0.5 * (high - low) * nodes
         dy = 0.5 * (high - low) * weights
         if isinstance(shape, Box):

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
-from scipy.optimize import lsq_linear
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 PAIR_NAMES = list(PAIRS)
 IDS = ["_".join(pair) for pair in PAIR_NAMES]
@@ -100,7 +101,10 @@ def call(pair, a, pa, qa, b, pb, qb):
 def separation_of(pair, *arguments):
     """Deepest active separation, shape (1, W)."""
     manifold = call(pair, *arguments)
-    return jnp.min(jnp.stack([jnp.where(p.active, p.separation, jnp.inf) for p in manifold.points]), axis=0)
+    best = manifold.points[0].separation
+    for point in manifold.points[1:]:
+        best = jnp.where(point.active & (point.separation < best), point.separation, best)
+    return best
 
 
 _compiled = {}
@@ -117,11 +121,12 @@ class Result:
     """A manifold as float64 NumPy arrays: normal (W, 3), position (W, P, 3), others (W, P)."""
 
     def __init__(self, pair, scene, dtype):
-        manifold = compiled(call, pair)(*to_engine(scene, dtype))
         count = len(scene["pb"])
+        padded = jax.tree.map(lambda rows: np.resize(rows, (POSE_COUNT, *rows.shape[1:])), scene)  # one compilation
+        manifold = compiled(call, pair)(*to_engine(padded, dtype))
 
         def full(array):
-            return np.broadcast_to(np.asarray(array), (1, count))[0]
+            return np.broadcast_to(np.asarray(array), (1, POSE_COUNT))[0, :count]
 
         self.normal = np.stack([full(c) for c in manifold.normal], -1).astype(float)
         self.position = np.stack([np.stack([full(c) for c in p.position], -1) for p in manifold.points], 1).astype(
@@ -366,6 +371,7 @@ def test_derivative_against_central_differences(pair, float64):
         here = np.asarray(value(*arguments))
         smooth = np.abs(sides[0] + sides[1] - 2 * here) < 1e-9  # no change of feature within the step
         assert smooth.mean() > 0.9
+        assert np.isfinite(derivative).all()
         error = np.abs((sides[1] - sides[0]) / (2 * step) - np.asarray(derivative))
         assert np.quantile(error[smooth], 0.99) < 1e-6
         compared += 1
@@ -397,7 +403,7 @@ def fixed_scene(pair, offsets, rotations_a, rotations_b, size=0.5):
 
 @pytest.mark.parametrize("pair", PAIR_NAMES, ids=IDS)
 def test_degenerate_poses_stay_finite_and_right(pair, precision):
-    """Coincident centres, parallel and crossing axes, exact touch of faces, edges and corners, tilts down to nothing."""
+    """Coincident centres, parallel and crossing axes, exact touch of faces, edges and corners, tilts to nothing."""
     turns = [Rotation.identity()]
     turns += [
         Rotation.from_rotvec(angle * np.eye(3)[k])
@@ -453,7 +459,8 @@ def test_box_stack_has_four_corners(tilt, half_b, precision):
 
 @pytest.mark.parametrize(("turn", "half_b"), [(0.0, 0.5), (0.0, 0.3), (0.0, 0.8), (0.4, 0.5), (0.7, 0.45)])
 def test_features_persist_in_a_resting_stack(turn, half_b, precision):
-    result = Result(("box", "box"), stack_scene(128, 1e-6, 1e-5, turn=turn, half_b=half_b), precision)
+    tremor = 1e-7 if turn else 1e-6  # an octagon offers near ties, which larger tremors do tip
+    result = Result(("box", "box"), stack_scene(128, tremor, 1e-5, turn=turn, half_b=half_b), precision)
     features = active_features(result)
     assert len(set(features[0])) == len(features[0]) == 4
     assert sum(f == features[0] for f in features) >= 0.99 * len(features)
@@ -508,20 +515,16 @@ def test_lying_capsule_has_two_points(pair, tilt, precision):
 
 
 @pytest.mark.parametrize("pair", PAIR_NAMES, ids=IDS)
-def test_parameters_of_one_world_broadcast(pair, precision):
+def test_parameters_of_one_world_broadcast(pair, float64):
     """Sizes shared by all worlds have a world axis of 1."""
-    scene = random_scene(pair, 16)
+    scene = random_scene(pair)
     for side in "ab":
-        scene[side] = {name: np.repeat(value[:1], 16, axis=0) for name, value in scene[side].items()}
-    arguments = to_engine(scene, precision)
+        scene[side] = {name: np.repeat(value[:1], POSE_COUNT, axis=0) for name, value in scene[side].items()}
+    arguments = to_engine(scene, float64)
     shared = list(arguments)
     for index in (0, 3):
         shared[index] = jax.tree.map(lambda x: x[:, :1], arguments[index])
-    ours, full = call(pair, *shared), call(pair, *arguments)
+    ours, full = compiled(call, pair)(*shared), compiled(call, pair)(*arguments)
     for point, expected in zip(ours.points, full.points, strict=True):
-        np.testing.assert_allclose(
-            np.broadcast_to(point.separation, (1, 16)),
-            np.broadcast_to(expected.separation, (1, 16)),
-            rtol=1e-4,
-            atol=1e-5,
-        )
+        gaps = [np.broadcast_to(p.separation, (1, POSE_COUNT)) for p in (point, expected)]
+        np.testing.assert_allclose(*gaps, atol=1e-9)

@@ -135,6 +135,8 @@ element("speed").addEventListener("change", (event) => setSpeed(Number(event.tar
 addEventListener("keydown", (event) => {
   const action = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
   if (!action || event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+  // A button reached by the tab key keeps the space bar for itself.
+  if (event.key === " " && event.target.tagName === "BUTTON") return;
   event.preventDefault();
   action();
 });

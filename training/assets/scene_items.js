@@ -42,11 +42,11 @@ function createScene(recording) {
   }
 
   function arrow(start, direction, size, width, colour) {
-    const tip = Math.min(3.2 * width, 0.6 * size);
+    const tip = Math.min(6 * width, 0.6 * size);
     const neck = add(start, scale(direction, size - tip));
     return [
       { mesh: shaft, colour, matrix: alongMatrix(start, direction, width, size - tip) },
-      { mesh: head, colour, matrix: alongMatrix(neck, direction, 0.45 * tip, tip) },
+      { mesh: head, colour, matrix: alongMatrix(neck, direction, 0.38 * tip, tip) },
     ];
   }
 

@@ -10,6 +10,7 @@ from jax import Array, lax
 from mathota_jax.collision.box_axes import best_axis, contact_size, preference_margin, relative_rotation
 from mathota_jax.collision.box_clip import CROSSING_U, VERTEX, ClipPoint, clip_incident_face, code_parts
 from mathota_jax.collision.box_frame import BoxFrame, box_frame
+from mathota_jax.collision.closest import clamp, clamp_to_box
 from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import settle, settle_code
@@ -47,7 +48,8 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     apart = _closest_points(frame, crossing, size)
 
     # Separated, and the axis of the test is not the direction of the closest points: then those.
-    gap_grows = apart.separation > apart.depth + preference_margin(apart.depth, size)
+    round_off = 64.0 * jnp.finfo(t.x.dtype).eps * (size + jnp.abs(apart.depth))
+    gap_grows = apart.separation > apart.depth + preference_margin(apart.depth, size) + round_off
     face_misses = (clipped[0].code < 0) | ((apart.depth > 0) & gap_grows)
     edge_misses = crossing.clamped & (crossing.separation > 0)
     # What slot 0 holds: 0 a clipped point, 1 an edge crossing, 2 closest points of separated boxes,
@@ -112,9 +114,9 @@ def _edge_contact(frame: BoxFrame) -> _EdgeContact:
     other = frame.center + first * (sides[2] * frame.incident_half.y) + second * (sides[3] * frame.incident_half.z)
     gap_u, gap_v = other.x - edge_u, other.y - edge_v
     parameter = -(gap_u * along.x + gap_v * along.y) * inverse_squared
-    inside = jnp.clip(parameter, -frame.incident_half.x, frame.incident_half.x)
+    inside = clamp(parameter, -frame.incident_half.x, frame.incident_half.x)
     point_b = other + along * inside
-    point_a = Vec3(edge_u, edge_v, jnp.clip(point_b.z, -frame.half.z, frame.half.z))
+    point_a = Vec3(edge_u, edge_v, clamp(point_b.z, -frame.half.z, frame.half.z))
     edge_a = 4 * frame.axis + (bits & 3)
     edge_b = 4 * frame.incident_axis + (bits >> 2)
     return _EdgeContact(
@@ -145,8 +147,8 @@ def _closest_points(frame: BoxFrame, crossing: _EdgeContact, size: Array) -> _Cl
         Vec3(*(side * half for side, half in zip(_deepest_corner_sides(frame), frame.incident_half, strict=True)))
     )
     start = lax.stop_gradient(where(frame.edge, crossing.point_b, corner))
-    on_b = _onto_incident(frame, _clamp(start, lax.stop_gradient(frame.half)))
-    on_a = _clamp(on_b, frame.half)
+    on_b = _onto_incident(frame, clamp_to_box(start, lax.stop_gradient(frame.half)))
+    on_a = clamp_to_box(on_b, frame.half)
     difference = on_b - on_a
     squared = dot(difference, difference)
     tiny = (16.0 * jnp.finfo(squared.dtype).eps * size) ** 2
@@ -155,7 +157,7 @@ def _closest_points(frame: BoxFrame, crossing: _EdgeContact, size: Array) -> _Cl
     return _ClosestPoints(
         usable=usable,
         normal=difference * inverse,
-        middle=where(usable, (on_a + on_b) * 0.5, _clamp(corner, frame.half)),
+        middle=where(usable, (on_a + on_b) * 0.5, clamp_to_box(corner, frame.half)),
         separation=squared * inverse,
         depth=corner.z - frame.half.z,
     )
@@ -167,12 +169,8 @@ def _deepest_corner_sides(frame: BoxFrame) -> list[Array]:
     return [jnp.where((bits >> k) & 1 == 1, 1.0, -1.0).astype(frame.half.x.dtype) for k in range(3)]
 
 
-def _clamp(point: Vec3, half: Vec3) -> Vec3:
-    return Vec3(*(jnp.clip(p, -h, h) for p, h in zip(point, half, strict=True)))
-
-
 def _onto_incident(frame: BoxFrame, point: Vec3) -> Vec3:
-    local = _clamp(frame.incident.apply_transposed(point - frame.center), frame.incident_half)
+    local = clamp_to_box(frame.incident.apply_transposed(point - frame.center), frame.incident_half)
     return frame.center + frame.incident.apply(local)
 
 

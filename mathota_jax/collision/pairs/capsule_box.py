@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.closest import round_point
+from mathota_jax.collision.closest import clamp, clamp_to_box, round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import settle, settle_code
@@ -42,7 +42,7 @@ def capsule_box(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose
 
     parameter = _closest_parameter(center, reach, half)
     core = center + reach * parameter
-    nearest = _clamp(core, half)
+    nearest = clamp_to_box(core, half)
     gap = core - nearest
     squared = dot(gap, gap)
     tiny = (16.0 * jnp.finfo(squared.dtype).eps * size) ** 2
@@ -58,8 +58,8 @@ def capsule_box(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose
     outward = where(on_face, face_normal, where(on_edge, edge_normal, gap * inverse))
     normal = -pose_b.rotation.apply(outward)
 
-    starts, enters = _crossing(center, reach, half, axis, size, -1.0)
-    ends, leaves = _crossing(center, reach, half, axis, size, 1.0)
+    starts, enters = _crossing(center, reach, half, axis, on_face, size, -1.0)
+    ends, leaves = _crossing(center, reach, half, axis, on_face, size, 1.0)
     single = jnp.where(on_edge, edge_parameter, parameter)
     at_end = lax.stop_gradient(jnp.where(single <= -1.0, 0, jnp.where(single >= 1.0, 1, CLOSEST_FEATURE)))
     two = settle((on_face & (lax.stop_gradient(ends - starts) > SLAB_TOLERANCE)).astype(squared.dtype)) > 0.5
@@ -88,10 +88,6 @@ def capsule_box(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose
     return Manifold(normal, tuple(points))
 
 
-def _clamp(point: Vec3, half: Vec3) -> Vec3:
-    return Vec3(*(jnp.clip(p, -h, h) for p, h in zip(point, half, strict=True)))
-
-
 def _not_zero(value: Array, scale: Any) -> Array:
     """`value`, moved off zero by a round-off share of `scale`, so that quotients stay finite."""
     tiny = jnp.finfo(value.dtype).eps ** 2 * scale
@@ -108,13 +104,13 @@ def _closest_parameter(center: Vec3, reach: Vec3, half: Vec3) -> Array:
 
     def slope(t: Any) -> Array:
         point = frozen_center + frozen_reach * t
-        return dot(point - _clamp(point, frozen_half), frozen_reach)
+        return dot(point - clamp_to_box(point, frozen_half), frozen_reach)
 
     size = frozen_half.x + frozen_half.y + frozen_half.z
     low, slope_low = jnp.full_like(frozen_center.x, -1.0), slope(-1.0)
     high, slope_high = jnp.full_like(low, 1.0), slope(1.0)
     bends = [
-        settle(jnp.clip((s * h - c) / _not_zero(r, size), -1.0, 1.0))
+        settle(clamp((s * h - c) / _not_zero(r, size), -1.0, 1.0))
         for c, r, h in zip(frozen_center, frozen_reach, frozen_half, strict=True)
         for s in (-1.0, 1.0)
     ]
@@ -125,7 +121,7 @@ def _closest_parameter(center: Vec3, reach: Vec3, half: Vec3) -> Array:
         low, slope_low = jnp.where(below, bend, low), jnp.where(below, here, slope_low)
         high, slope_high = jnp.where(above, bend, high), jnp.where(above, here, slope_high)
     rise = slope_high - slope_low
-    inside = low + (high - low) * jnp.clip(-slope_low / jnp.where(rise > 0, rise, 1.0), 0.0, 1.0)
+    inside = low + (high - low) * clamp(-slope_low / jnp.where(rise > 0, rise, 1.0), 0.0, 1.0)
     found = settle(jnp.where(start, -1.0, jnp.where(stop, 1.0, inside)))
 
     numerator, denominator = jnp.zeros_like(found), jnp.zeros_like(found)
@@ -184,7 +180,9 @@ def _over_face(center: Vec3, reach: Vec3, half: Vec3, axis: int, size: Any) -> A
     return jnp.asarray(high > low)
 
 
-def _crossing(center: Vec3, reach: Vec3, half: Vec3, axis: Array, size: Any, end: float) -> tuple[Array, Array]:
+def _crossing(
+    center: Vec3, reach: Vec3, half: Vec3, axis: Array, usable: Array, size: Any, end: float
+) -> tuple[Array, Array]:
     """Where the segment, followed to its `end` (-1 or 1), leaves the face across `axis`: parameter and feature."""
     frozen_center, frozen_reach, frozen_half, size = lax.stop_gradient((center, reach, half, size))
     best = jnp.ones_like(center.x)  # end * parameter
@@ -192,7 +190,7 @@ def _crossing(center: Vec3, reach: Vec3, half: Vec3, axis: Array, size: Any, end
     for k, (c, r, h) in enumerate(zip(frozen_center, frozen_reach, frozen_half, strict=True)):
         inverse = 1.0 / _not_zero(r, h)
         exit_parameter = -end * c * inverse + (h + SLAB_TOLERANCE * size) * jnp.abs(inverse)
-        sooner = (axis != k) & (exit_parameter < best)
+        sooner = usable & (axis != k) & (exit_parameter < best)
         best = jnp.where(sooner, exit_parameter, best)
         code = jnp.where(sooner, 2.0 * k + (end * r > 0), code)
     code = settle_code(code)
@@ -200,7 +198,7 @@ def _crossing(center: Vec3, reach: Vec3, half: Vec3, axis: Array, size: Any, end
     for k, (c, r, h) in enumerate(zip(center, reach, half, strict=True)):
         here = code >> 1 == k
         side = jnp.where((code & 1) == 1, 1.0, -1.0).astype(h.dtype)
-        parameter = jnp.where(here, jnp.clip((side * h - c) / jnp.where(here, r, 1.0), -1.0, 1.0), parameter)
+        parameter = jnp.where(here, clamp((side * h - c) / jnp.where(here, _not_zero(r, h), 1.0), -1.0, 1.0), parameter)
     return parameter, jnp.where(code < 0, 0 if end < 0 else 1, 2 + code)
 
 
@@ -220,9 +218,9 @@ def _edge(center: Vec3, reach: Vec3, half: Vec3, axis: Array, sign: Array, usabl
     edge_i = jnp.where((bits & 1) == 1, 1.0, -1.0).astype(sign.dtype) * cyclic(half, 1)
     edge_j = jnp.where(bits >= 2, 1.0, -1.0).astype(sign.dtype) * cyclic(half, 2)
     parameter = ((edge_i - cyclic(center, 1)) * r_i + (edge_j - cyclic(center, 2)) * r_j) / squared
-    parameter = jnp.clip(parameter, -1.0, 1.0)
+    parameter = clamp(parameter, -1.0, 1.0)
     along = cyclic(half, 0)
-    edge_k = jnp.clip(cyclic(center, 0) + parameter * cyclic(reach, 0), -along, along)
+    edge_k = clamp(cyclic(center, 0) + parameter * cyclic(reach, 0), -along, along)
     zero = jnp.zeros_like(n_i)
 
     def restore(k: Array, i: Array, j: Array) -> Vec3:

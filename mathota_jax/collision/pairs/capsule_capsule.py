@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.collision.closest import closest_parameters, direction, perpendicular, round_point
+from mathota_jax.collision.closest import clamp, closest_parameters, direction, perpendicular, round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
@@ -68,4 +68,4 @@ def capsule_capsule(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: 
 
 def _partner(t: Array, along: Array, cosine: Array, length_b: Any) -> Array:
     """Parameter on B whose point lies level with parameter `t` on A."""
-    return jnp.clip(safe_divide(t - along, cosine), -length_b, length_b)
+    return clamp(safe_divide(t - along, cosine), -length_b, length_b)

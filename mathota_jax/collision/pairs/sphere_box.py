@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from mathota_jax.collision.closest import round_point
+from mathota_jax.collision.closest import clamp_to_box, round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import settle_code
@@ -16,7 +16,7 @@ def sphere_box(sphere: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose_b
     assert pose_b.rotation is not None
     half = box["half_extents"]
     center = pose_b.point_to_local(pose_a.position)
-    nearest = Vec3(*(jnp.clip(c, -h, h) for c, h in zip(center, half, strict=True)))
+    nearest = clamp_to_box(center, half)
     outward = center - nearest
     squared = dot(outward, outward)
     size = sphere["radius"] + jnp.minimum(half.x, jnp.minimum(half.y, half.z))

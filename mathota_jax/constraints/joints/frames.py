@@ -12,6 +12,7 @@ from mathota_jax.bodies import Bodies, quaternion, vector
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot
 
 
@@ -71,9 +72,10 @@ def joint_frames(model: Model, bodies: Bodies, joints: tuple[int, ...]) -> Joint
     offset = (child_position + arm_child) - (parent_position + arm_parent)
     parent, child = multiply(parent_orientation, frame_parent), multiply(child_orientation, frame_child)
     inverse = Quaternion(parent.w, -parent.x, -parent.y, -parent.z)
-    return JointFrames(
+    frames = JointFrames(
         arm_parent + offset, arm_child, offset, to_matrix(parent), to_matrix(child), multiply(inverse, child)
     )
+    return compute_once(frames, offset.x)
 
 
 def translation_sides(frames: JointFrames, direction: Vec3) -> tuple[Side, Side]:

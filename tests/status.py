@@ -1,0 +1,162 @@
+"""Writes the generated parts of the README: what exists, and what was measured.
+
+`python -m tests.status` rewrites them; `tests/unit/test_readme.py` fails when they are out of date. A feature counts as
+existing when the code that makes it can be imported, and as working only with a test beside it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import pathlib
+import re
+import sys
+from types import ModuleType
+from typing import NamedTuple
+
+from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.geometry import SHAPES
+from tests.benchmarks.figures import Figure, figures
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+REPORT = ROOT / "tests" / "benchmarks" / "results" / "report.json"
+PLANNED_SHAPES = ("polyhedron", "cylinder", "cone", "compound", "heightfield")
+HEADLINES = (
+    "world-steps per CPU-second",
+    "error of the",
+    "rate over that of",
+    "vmap(step) over",
+    "value and gradient over forward",
+    "dx/dv sliding",
+    "compile time",
+)
+
+
+class Feature(NamedTuple):
+    """One line of the feature table: `module:attribute` that makes it, and the test (file or folder) that shows it."""
+
+    name: str
+    source: str
+    test: str
+
+
+FEATURES = (
+    Feature(
+        "`jit`, `vmap`, `grad`, `jacfwd`, `scan`, `checkpoint` in any order",
+        "mathota_jax.batching:batch_last",
+        "unit/test_batch_last.py",
+    ),
+    Feature(
+        "gradients through contact, friction and impacts", "mathota_jax:rollout", "gradients/test_slide_gradient.py"
+    ),
+    Feature("isotropic friction cone", "mathota_jax.constraints:contact", "physics/test_slide.py"),
+    Feature("restitution", "mathota_jax.constraints:contact", "physics/test_bounce.py"),
+    Feature("warm-started projected Gauss-Seidel", "mathota_jax.solver:pgs", "physics/test_warm_start.py"),
+    Feature("exact free flight, gyroscopic rotation", "mathota_jax.dynamics:free_motion", "physics/test_tumble.py"),
+    Feature("hinge and slider with limits, damping, motors", "mathota_jax:Hinge", "physics/test_joints.py"),
+    Feature("flags for worlds that go wrong", "mathota_jax:Flag", "unit/test_flags.py"),
+    Feature("Gymnasium `Env` and `VectorEnv`", "mathota_envs:GymVectorEnv", "envs"),
+    Feature("stable-baselines3 `VecEnv`", "mathota_envs:sb3", "envs"),
+    Feature("training with PPO on the device", "training:ppo", "training"),
+    Feature("ball, fixed and distance joints", "mathota_jax:BallAndSocket", "physics/test_joints.py"),
+    Feature("GJK and EPA for general convex shapes", "mathota_jax.collision:gjk", "unit/test_gjk.py"),
+    Feature("sleeping and islands", "mathota_jax.dynamics:sleep", "physics/test_sleep.py"),
+    Feature("substepped soft contacts", "mathota_jax.solver:soft_step", "physics/test_soft_step.py"),
+    Feature("articulated trees", "mathota_jax.dynamics:articulated", "physics/test_articulated.py"),
+    Feature("MJCF, URDF and meshes", "mathota_jax:io", "unit/test_io.py"),
+)
+
+
+def main() -> int:
+    """Rewrites the README; returns the exit status."""
+    README.write_text(render(README.read_text()))
+    return 0
+
+
+def render(text: str) -> str:
+    """The README with its generated parts up to date."""
+    for name, content in (("status", status()), ("figures", measured())):
+        pattern = rf"(<!-- {name}:begin[^>]*-->\n).*?(<!-- {name}:end -->)"
+        text, count = re.subn(pattern, lambda found, content=content: found[1] + content + found[2], text, flags=re.S)
+        if count != 1:
+            raise ValueError(f"README.md needs one pair of markers <!-- {name}:begin --> and <!-- {name}:end -->")
+    return text
+
+
+def status() -> str:
+    """Shapes x pairs, then features."""
+    kinds = list(SHAPES)
+    lines = ["| contact points | " + " | ".join(kinds) + " |", "|---|" + "---|" * len(kinds)]
+    lines += [f"| **{first}** | " + " | ".join(_pair(first, second) for second in kinds) + " |" for first in kinds]
+    missing = [kind for kind in PLANNED_SHAPES if kind not in SHAPES]
+    if missing:
+        lines += ["", f"Shapes not yet here: {', '.join(missing)}. Two planes never move, so they never meet."]
+    present = [feature for feature in FEATURES if exists(feature)]
+    lines += ["", "| works | tested in |", "|---|---|"]
+    lines += [f"| {feature.name} | `tests/{feature.test}` |" for feature in present if tested(feature)]
+    untested = [feature.name for feature in present if not tested(feature)]
+    if untested:
+        lines += ["", f"Written, but without a test: {'; '.join(untested)}."]
+    absent = [feature.name for feature in FEATURES if feature not in present]
+    if absent:
+        lines += ["", f"Not yet here: {'; '.join(absent)}."]
+    return "\n".join(lines) + "\n"
+
+
+def _pair(first: str, second: str) -> str:
+    pair = PAIRS.get((first, second)) or PAIRS.get((second, first))
+    if pair is not None:
+        return str(pair.point_count)
+    return "-" if first == second == "plane" else "not yet"
+
+
+def exists(feature: Feature) -> bool:
+    """Whether the code of a feature is there."""
+    module_name, attribute = feature.source.split(":")
+    module = _import(module_name)
+    return module is not None and (hasattr(module, attribute) or _import(f"{module_name}.{attribute}") is not None)
+
+
+def _import(name: str) -> ModuleType | None:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            raise
+        return None
+
+
+def tested(feature: Feature) -> bool:
+    """Whether the test of a feature is there."""
+    path = ROOT / "tests" / feature.test
+    return any(path.glob("test_*.py")) if path.is_dir() else path.exists()
+
+
+def measured() -> str:
+    """Headline figures of the last report with their settings."""
+    if not REPORT.exists():
+        return "Not measured yet: `make bench`.\n"
+    report = json.loads(REPORT.read_text())
+    machine = report["machine"]
+    kind = "quick run, too short for publication" if report["settings"]["mode"] == "quick" else "full run"
+    lines = [
+        f"{machine['processor']}, {machine['cores']} cores, {report['date']}, {kind}; medians, per CPU-second of all "
+        "threads, peers interleaved in the same run. All figures: "
+        "[`tests/benchmarks/results/report.md`](tests/benchmarks/results/report.md).",
+        "",
+        "| figure | measured | target | settings |",
+        "|---|---|---|---|",
+    ]
+    lines += [_line(figure) for figure in figures(report) if any(part in figure.name for part in HEADLINES)]
+    return "\n".join(lines) + "\n"
+
+
+def _line(figure: Figure) -> str:
+    verdict = {True: "met", False: "**missed**", None: ""}[figure.met]
+    target = f"{figure.target}: {verdict}" if figure.target else verdict
+    return f"| {figure.name} | {figure.value} | {target} | {figure.settings} |"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
