@@ -94,9 +94,22 @@ _INVERTED_PENDULUM = Hyperparameters(
     worlds=20, steps=200_000, samples_per_update=2000, minibatch_count=20, epochs=10, evaluations=100
 )
 
+_BALL_BALANCE = Hyperparameters(
+    worlds=64,
+    steps=300_000,
+    samples_per_update=4096,
+    minibatch_count=16,
+    epochs=10,
+    learning_rate=6e-4,
+    anneal=True,
+    discount=0.98,
+)
+
 PRESETS: dict[tuple[str, str], Hyperparameters] = {
     ("mathota/InvertedPendulum-v0", "sb3"): _INVERTED_PENDULUM,
     ("mathota/InvertedPendulum-v0", "jax"): _INVERTED_PENDULUM,
+    ("mathota/BallBalance-v0", "sb3"): _BALL_BALANCE,
+    ("mathota/BallBalance-v0", "jax"): _BALL_BALANCE,
 }
 
 

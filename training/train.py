@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import jax
 import numpy as np
 
 from mathota_envs import make
-from mathota_jax import contacts
+from mathota_jax import Model, State, contact_forces, contacts
 from training.evaluate import Evaluation, Evaluator
 from training.policies import save_policy
 from training.presets import Hyperparameters, preset, require_whole_number
@@ -243,15 +244,27 @@ def _save_pictures(plan: Plan, evaluation: Evaluation, metrics: dict[str, Any]) 
         plan.request.target_return,
     )
     environment, states = plan.environment, evaluation.trajectory.state
-    contact_points = jax.jit(jax.vmap(contacts, in_axes=(None, 0)))(environment.model, states)
     write_replay(
         plan.folder / REPLAY_FILE,
         environment.model,
         states,
         environment.dt,
-        contacts=contact_points,
+        contacts=_contact_data(environment.model, states),
         title=f"{name}: return {evaluation.returns[0]:.1f}",
     )
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0))
+def _contact_data(model: Model, state: State) -> dict[str, jax.Array]:
+    points = contacts(model, state)
+    return {
+        "position": points.position,
+        "normal": points.normal,
+        "separation": points.separation,
+        "active": points.active,
+        "force": contact_forces(model, state),
+    }
 
 
 def _machine() -> dict[str, Any]:

@@ -85,7 +85,7 @@ class Environment(abc.ABC):
     def step(
         self, env_state: EnvState, action: Array, model: Any = None
     ) -> tuple[EnvState, Array, Array, Array, Array, dict[str, Array]]:
-        """Advances one world by one control interval. Pure and differentiable; never resets.
+        """Advances one world by one control interval. Pure and differentiable; never resets; compiled by itself.
 
         Args:
             env_state: where the world stands.
@@ -121,17 +121,21 @@ class Environment(abc.ABC):
                 f"{type(self).__name__}: {name} must be a number between {minimum} and {maximum}, got {value!r}"
             )
 
-    def checked_action(self, action: Any) -> Array:
-        """The action as an array clipped to the bounds.
+    def checked_action(self, action: Any) -> Any:
+        """The action as an array, not yet clipped.
 
         Raises:
             ValueError: its shape is not that of `action_space`.
         """
-        action = jnp.asarray(action)
+        action = action if isinstance(action, Array | np.ndarray) else np.asarray(action, self.action_space.dtype)
         if action.shape != self.action_space.shape:
             raise ValueError(
                 f"{type(self).__name__}: an action must have shape {self.action_space.shape}, got {action.shape}"
             )
+        return action
+
+    def clipped(self, action: Any) -> Array:
+        """The action within the bounds of `action_space`."""
         return jnp.clip(action, self.action_space.low, self.action_space.high)
 
     def checked_reset_options(self, options: Mapping[str, Any] | None) -> dict[str, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -14,8 +15,7 @@ from gymnasium.spaces import Box
 from jax import Array, lax
 
 from mathota_envs.base import Environment, EnvState, key_data
-from mathota_jax import Model, State, step
-from mathota_jax.state import Flag
+from mathota_jax import Flag, Model, State, step
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,30 +84,42 @@ class SimulatedEnvironment(Environment):
 
     def reset(self, key: Array, options: Mapping[str, Any] | None = None) -> tuple[EnvState, Array]:
         """See `Environment.reset`."""
-        start_key, later_key = jax.random.split(key)
-        state, extras = self.start(start_key, self.checked_reset_options(options))
-        env_state = EnvState(state, key_data(later_key), jnp.zeros((), jnp.int32), extras)
-        return env_state, self.observe(self.model, env_state)
+        return _reset(self, key, self.checked_reset_options(options))
 
     def step(
         self, env_state: EnvState, action: Any, model: Model | None = None
     ) -> tuple[EnvState, Array, Array, Array, Array, dict[str, Array]]:
-        """See `Environment.step`."""
-        model = self.model if model is None else model
-        action = self.checked_action(action)
-        length = self.frame_skip * self.substeps
-        state, _ = lax.scan(lambda state, _: (step(model, state, action), None), env_state.state, None, length=length)
-        env_state = dataclasses.replace(env_state, state=state, step_count=env_state.step_count + 1)
-        raw_observation = self.observe(model, env_state)
-        finite = jnp.isfinite(raw_observation)
-        observation = jnp.where(finite, raw_observation, 0.0)
-        non_finite = ((state.flags & Flag.NON_FINITE) != 0) | ~finite.all()
-        reward, terminated, info = self.judge(observation, action)
-        return (
-            env_state,
-            observation,
-            jnp.where(non_finite, 0.0, reward),
-            terminated | non_finite,
-            self.is_truncated(env_state.step_count),
-            {**info, "non_finite": non_finite},
-        )
+        """See `Environment.step`. Another `model` of the same scene does not compile anew."""
+        return _step(self, self.model if model is None else model, env_state, self.checked_action(action))
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset(environment: SimulatedEnvironment, key: Array, options: dict[str, Array]) -> tuple[EnvState, Array]:
+    start_key, later_key = jax.random.split(key)
+    state, extras = environment.start(start_key, options)
+    env_state = EnvState(state, key_data(later_key), jnp.zeros((), jnp.int32), extras)
+    return env_state, environment.observe(environment.model, env_state)
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(
+    environment: SimulatedEnvironment, model: Model, env_state: EnvState, action: Array
+) -> tuple[EnvState, Array, Array, Array, Array, dict[str, Array]]:
+    action = environment.clipped(action)
+    length = environment.frame_skip * environment.substeps
+    # A loop, not an unrolled chain: the compile time must not grow with the frame skip.
+    state, _ = lax.scan(lambda state, _: (step(model, state, action), None), env_state.state, None, length=length)
+    env_state = dataclasses.replace(env_state, state=state, step_count=env_state.step_count + 1)
+    raw_observation = environment.observe(model, env_state)
+    finite = jnp.isfinite(raw_observation)
+    observation = jnp.where(finite, raw_observation, 0.0)
+    non_finite = ((state.flags & Flag.NON_FINITE) != 0) | ~finite.all()
+    reward, terminated, info = environment.judge(observation, action)
+    return (
+        env_state,
+        observation,
+        jnp.where(non_finite, 0.0, reward),
+        terminated | non_finite,
+        environment.is_truncated(env_state.step_count),
+        {**info, "non_finite": non_finite},
+    )

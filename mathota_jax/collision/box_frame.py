@@ -92,7 +92,7 @@ def box_frame(
         origin=_pick(reference_b, pose_a.position, pose_b.position),
         basis=compute_once(Mat3(axis_u, axis_v, axis_w * sign), incident_code),
         center=compute_once(
-            Vec3(_cyclic(axis, 1, center), _cyclic(axis, 2, center), _cyclic(axis, 0, center) * sign), one
+            Vec3(_cyclic(axis, 1, center), _cyclic(axis, 2, center), _cyclic(axis, 0, center) * sign), incident_code
         ),
         incident=incident,
         half=Vec3(_cyclic(axis, 1, half), _cyclic(axis, 2, half), _cyclic(axis, 0, half)),

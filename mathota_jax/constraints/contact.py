@@ -156,11 +156,9 @@ def _impact(
     time = jnp.clip(jnp.where(hits & (start < 0), gap / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
     target = jnp.where(hits, 0.0, -gap / dt)
     impact = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
-    remaining = dt - time
-    # Share of the impulse that stops the approach; the rest holds the weight for the remaining time, at half of it.
-    weight = norm(motion.gravity) * remaining
-    rest_share = safe_divide(weight, impact + weight)
-    lever = remaining * (1.0 - 0.5 * rest_share)
+    # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
+    share = safe_divide(impact, impact + norm(motion.gravity) * dt)
+    lever = 0.5 * dt + share * (0.5 * dt - time)
     if not scene.restitution:
         return target, lever
     acceleration = (free - start) / dt

@@ -14,6 +14,7 @@ have no derivative.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -24,7 +25,7 @@ from jax import Array, lax
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.table import Table
 from mathota_jax.spatial.indexing import take
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import store
 from mathota_jax.struct import pytree, static
 
 UNROLLED_TURNS = 12
@@ -131,7 +132,7 @@ def _turn(update: Update, velocity: Array, blocks: tuple, receivers: object, val
         error = error + _project(side_jacobian, _gather(velocity, side_blocks))
     new = update(coefficients, impulse, error)
     # Stored, because every later row of the sweep depends on it: a chain of rows must not be computed again for each.
-    new = compute_once(new, new)
+    new = store(new, response[0][:, 0])
     return _receive(velocity, receivers, [_respond(side, new - impulse) for side in response]), new
 
 
@@ -205,23 +206,71 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses)
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
-    linear, constants = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        at_blocks = [_all_turns(velocity, side) for side in group.table.blocks]
-        error, d_error = group.bias, d_group.bias
-        for jacobian, d_jacobian, block in zip(group.jacobian, d_group.jacobian, at_blocks, strict=True):
-            error = error + _project(jacobian, block)
-            d_error = d_error + _project(d_jacobian, block)
-        matrices = _linearise(group.law, impulse, error)
-        linear.append(matrices)
-        constants.append(
+        d_velocity = _add_responses(group.table, d_group.response, d_velocity, impulse)
+    jacobians, right_sides = [], []
+    for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
+        error = group.bias + row_velocity(group, velocity)
+        d_error = d_group.bias + row_velocity(group, d_velocity)
+        d_error = d_error + row_velocity(dataclasses.replace(group, jacobian=d_group.jacobian), velocity)
+        jacobians.append(_linearise(group.law, impulse, error))
+        right_sides.append(
             jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023
         )
-        d_velocity = _add_responses(group.table, d_group.response, d_velocity, impulse)
-    coefficients = tuple(zip(linear, constants, strict=True))
-    zeros = tuple(jnp.zeros_like(constant) for constant in constants)
-    d_velocity, d_impulses = _iterate(gradient_iterations, rows, _linear_update, coefficients, zeros, d_velocity, zeros)
-    return (velocity, impulses), (d_velocity, d_impulses)
+    d_impulses = _solve_linear(gradient_iterations, rows, tuple(jacobians), tuple(right_sides))
+    return (velocity, impulses), (_add_impulses(rows, d_velocity, d_impulses), d_impulses)
+
+
+def _solve_linear(
+    iterations: int, rows: tuple[Rows, ...], jacobians: tuple[tuple[Array, Array], ...], right_sides: tuple[Array, ...]
+) -> tuple[Array, ...]:
+    """Solves ``x = K x + H J (M^-1 J^T x) + right side`` by sweeps; transposable and differentiable in everything.
+
+    `jacobians` holds for each group the Jacobians K and H of its law with respect to impulse and error. The transposed
+    system, ``z = K^T z + (M^-1 J^T)^T (J^T H^T z) + ...``, has the same form: Jacobian and response change places.
+    """
+
+    def product(x: tuple[Array, ...]) -> tuple[Array, ...]:
+        velocity = _add_impulses(rows, _no_velocity(rows), x)
+        return tuple(
+            part - _apply(by_impulse, part) - _apply(by_error, row_velocity(group, velocity))
+            for part, group, (by_impulse, by_error) in zip(x, rows, jacobians, strict=True)
+        )
+
+    def solve_forward(_: Callable, right_sides: tuple[Array, ...]) -> tuple[Array, ...]:
+        coefficients = tuple((*jacobian, side) for jacobian, side in zip(jacobians, right_sides, strict=True))
+        return _linear_sweeps(iterations, rows, coefficients)
+
+    def solve_transposed(_: Callable, right_sides: tuple[Array, ...]) -> tuple[Array, ...]:
+        swapped, coefficients = [], []
+        for group, (by_impulse, by_error), side in zip(rows, jacobians, right_sides, strict=True):
+            weighted = tuple(_weigh(jacobian, by_error) for jacobian in group.jacobian)
+            swapped.append(dataclasses.replace(group, jacobian=group.response, response=weighted))
+            coefficients.append((jnp.swapaxes(by_impulse, 1, 2), None, side))
+        return _linear_sweeps(iterations, tuple(swapped), tuple(coefficients))
+
+    return lax.custom_linear_solve(product, right_sides, solve_forward, transpose_solve=solve_transposed)
+
+
+def _linear_sweeps(iterations: int, rows: tuple[Rows, ...], coefficients: tuple[object, ...]) -> tuple[Array, ...]:
+    zeros = tuple(jnp.zeros_like(group.bias) for group in rows)
+    return _iterate(iterations, rows, _linear_update, coefficients, zeros, _no_velocity(rows), zeros)[1]
+
+
+def _no_velocity(rows: tuple[Rows, ...]) -> Array:
+    response = rows[0].response[0]
+    return jnp.zeros((response.shape[2], rows[0].table.block_count, response.shape[4]), response.dtype)
+
+
+def _apply(matrix: Array, x: Array) -> Array:
+    """(turn, row, row', ...) times (turn, row', ...)."""
+    return functools.reduce(jnp.add, [matrix[:, :, row] * x[:, None, row] for row in range(x.shape[1])])
+
+
+def _weigh(jacobian: Array, by_error: Array) -> Array:
+    """``H J``: (turn, row, component, ...), the velocity change that a unit of each adjoint row causes."""
+    terms = [by_error[:, :, row, None] * jacobian[:, None, row] for row in range(jacobian.shape[1])]
+    return functools.reduce(jnp.add, terms)
 
 
 def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...]) -> Array:
@@ -245,8 +294,10 @@ def _linearise(law: Law, impulse: Array, error: Array) -> tuple[Array, Array]:
 
 
 def _linear_update(coefficients: object, impulse: Array, error: Array) -> Array:
-    (by_impulse, by_error), constant = coefficients  # type: ignore[misc]
-    new = constant
+    by_impulse, by_error, right_side = coefficients  # type: ignore[misc]
+    new = right_side if by_error is not None else right_side + error
     for row in range(impulse.shape[0]):
-        new = new + by_impulse[:, row] * impulse[row] + by_error[:, row] * error[row]
+        new = new + by_impulse[:, row] * impulse[row]
+        if by_error is not None:
+            new = new + by_error[:, row] * error[row]
     return new

@@ -40,9 +40,21 @@ def compute_once(values: Any, like: Array) -> Any:
             cost a kernel, while computing it again costs nothing beside what is done for each world.
     """
     worlds = like.shape[-1]
-    return jax.tree.map(lambda value: value if worlds > 1 and jnp.shape(value)[-1:] in ((), (1,)) else _store(value), values)
+
+    def once(value: Array) -> Array:
+        shared = worlds > 1 and jnp.shape(value)[-1:] in ((), (1,))
+        return value if shared else store(value, value)
+
+    return jax.tree.map(once, values)
 
 
-def _store(value: Array) -> Array:
-    # The divisor has the shape of the value: XLA turns a division by a broadcast scalar into a product, which it copies.
-    return value / (lax.stop_gradient(value) * 0 + 1)
+def store(value: Array, source: Array) -> Array:
+    """Returns `value` unchanged, computed exactly once.
+
+    Args:
+        value: Floating-point array.
+        source: Finite array of the same shape from which the divisor is made. It may be `value` itself, unless `value`
+            has to stay linear in something. (XLA turns a division by a broadcast scalar into a product, which it copies;
+            so the divisor needs the full shape.)
+    """
+    return value / (lax.stop_gradient(source) * 0 + 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 
 SLIDE_TARGET, BOUNCE_TARGET, APEX_TARGET, HAND_BATCHED_TARGET = 4.0, 10.0, 0.01, 0.9
@@ -135,7 +136,7 @@ def _gradient(result: dict) -> Iterator[Figure]:
         for name, error in result[group].items():
             strict = name == "dx/dv"
             limit = f"at most {percent(DERIVATIVE_TARGET)}" if strict else ""
-            met = error <= DERIVATIVE_TARGET if strict else None
+            met = error <= DERIVATIVE_TARGET if strict else None if math.isfinite(error) else False
             yield Figure(f"{name} {title}, relative error to the closed form", percent(error), limit, met, settings)
     memory = result["memory"]
     deviation = memory["deviation_from_line"]

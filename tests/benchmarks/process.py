@@ -27,6 +27,7 @@ def launch(name: str, settings: Settings, arguments: dict[str, Any] | None = Non
       MeasurementError: it failed, or took longer than `settings.timeout_seconds`.
     """
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    environment["JAX_TRACEBACK_FILTERING"] = "off"  # otherwise the last line of an error is not the error
     request = json.dumps({"name": name, "settings": dataclasses.asdict(settings), "arguments": arguments or {}})
     with tempfile.TemporaryDirectory() as folder:
         output = pathlib.Path(folder) / "result.json"

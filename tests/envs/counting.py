@@ -40,7 +40,7 @@ class Counting(Environment):
         return env_state, self._observe(env_state)
 
     def step(self, env_state: EnvState, action: Any, model: Any = None) -> tuple:
-        number = env_state.state + self.checked_action(action)[0]
+        number = env_state.state + self.clipped(self.checked_action(action))[0]
         env_state = dataclasses.replace(env_state, state=number, step_count=env_state.step_count + 1)
         info = {
             "above_one": number > 1.0,

@@ -121,7 +121,7 @@ def test_attributes_and_methods(pair):
     assert environment.get_attr("colour", indices=[0, 2]) == ["red", "red"]
     with pytest.raises(AttributeError):
         environment.get_attr("colour")
-    with pytest.raises(ValueError, match="cannot set 'ceiling'.*new SB3VecEnv"):
+    with pytest.raises(ValueError, match=r"cannot set 'ceiling'.*new SB3VecEnv"):
         environment.set_attr("ceiling", 4.0)
     assert [bool(x) for x in environment.env_method("is_truncated", np.int32(5), indices=[0])] == [True]
     assert environment.env_method("render") == [None] * WORLDS
@@ -156,18 +156,20 @@ def test_algorithms_of_sb3_learn_on_it(algorithm):
 
     arguments = {"PPO": {"n_steps": 8, "batch_size": 8, "n_epochs": 1}, "SAC": {"learning_starts": 8, "batch_size": 8}}
     environment = SB3VecEnv(Counting(), 2)
-    model = getattr(stable_baselines3, algorithm)("MlpPolicy", environment, seed=0, device="cpu", **arguments[algorithm])
+    model = getattr(stable_baselines3, algorithm)(
+        "MlpPolicy", environment, seed=0, device="cpu", **arguments[algorithm]
+    )
     model.learn(32)
     assert all(np.isfinite(value.numpy()).all() for value in model.policy.state_dict().values())
 
 
 def test_a_non_finite_world_ends_its_episode_and_spoils_nothing():
-    environment = SB3VecEnv(make("mathota/InvertedPendulum-v0"), 2, seed=0)
+    environment = SB3VecEnv(make("mathota/InvertedPendulum-v0"), 3, seed=0)
     environment.reset()
-    observations, rewards, dones, infos = environment.step(np.array([[np.nan], [0.1]]))
-    assert dones.tolist() == [True, False] and infos[0]["non_finite"] and not infos[0]["TimeLimit.truncated"]
+    observations, rewards, dones, infos = environment.step(np.array([[np.nan], [0.1], [0.0]]))
+    assert dones.tolist() == [True, False, False] and infos[0]["non_finite"] and not infos[0]["TimeLimit.truncated"]
     assert np.isfinite(observations).all() and rewards[0] == 0 and np.isfinite(infos[0]["terminal_observation"]).all()
-    assert not environment.step(np.zeros((2, 1)))[2].any()
+    assert not environment.step(np.zeros((3, 1)))[2].any()
 
 
 def test_bad_input_is_named():

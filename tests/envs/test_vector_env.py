@@ -1,5 +1,7 @@
 """`GymVectorEnv` against `gymnasium.vector.SyncVectorEnv` over single environments, in all three autoreset modes."""
 
+import dataclasses
+
 import gymnasium
 import numpy as np
 import pytest
@@ -155,14 +157,15 @@ def _arrays(result):
 
 @EVERY_ID
 def test_registered_vector_environment_equals_single_environments(id):
-    vector = gymnasium.make_vec(id, 3)
-    assert isinstance(vector, GymVectorEnv) and vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert gymnasium.make_vec(id, 3).metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    vector = gymnasium.make_vec(id, 3, autoreset_mode="SameStep")
+    assert isinstance(vector, GymVectorEnv)
     singles = [gymnasium.make(id, disable_env_checker=True) for _ in range(3)]
     observations, _ = vector.reset(seed=11)
     np.testing.assert_allclose(
         observations, [single.reset(seed=11 + i)[0] for i, single in enumerate(singles)], rtol=1e-5, atol=1e-6
     )
-    actions = np.linspace(-0.4, 0.4, 3)[:, None] * vector.single_action_space.high
+    actions = np.linspace(-0.1, 0.1, 3)[:, None] * vector.single_action_space.high
     for _ in range(4):
         got = vector.step(actions)
         want = [single.step(action) for single, action in zip(singles, actions, strict=True)]
@@ -176,9 +179,12 @@ def test_registered_vector_environment_equals_single_environments(id):
 
 @EVERY_ID
 def test_truncated_registered_worlds_start_anew_elsewhere(id):
-    vector = gymnasium.make_vec(id, 2, max_episode_steps=2, autoreset_mode="SameStep")
+    vector = gymnasium.make_vec(id, 3, autoreset_mode="SameStep")
     first, _ = vector.reset(seed=0)
-    vector.step(vector.action_space.sample() * 0)
+    late = dataclasses.replace(
+        vector.worlds.env_state, step_count=np.full(3, vector.environment.max_episode_steps - 1, np.int32)
+    )
+    vector.worlds = vector.worlds._replace(env_state=late)
     second, _, terminated, truncated, infos = vector.step(vector.action_space.sample() * 0)
     assert truncated.all() and not terminated.any() and infos["_final_obs"].all()
     assert not (second == first).all(axis=1).any()

@@ -1,19 +1,21 @@
-// Renderer on a 2D canvas, for machines without WebGL: triangles from far to near, flat shading.
+// Renderer on a 2D canvas, for machines without WebGL: triangles filled by this script with a depth buffer, flat shading.
 
 const css = (colour, alpha = 1) => `rgba(${colour.map((c) => Math.round(255 * c)).join(",")},${alpha})`;
 
 function createCanvasRenderer(canvas) {
   const context = canvas.getContext("2d");
+  // Putting a picture replaces what lies below; drawing another canvas blends with it.
+  const sheet = document.createElement("canvas");
 
-  function polygon(points, fill, edge = fill) {
+  function polygon(points, fill) {
     context.beginPath();
     for (const [x, y] of points) context.lineTo(x, y);
     context.closePath();
     context.fillStyle = fill;
-    context.strokeStyle = edge;
+    context.strokeStyle = fill;
     context.fill();
     // A line of the same colour hides the seams between neighbours.
-    if (edge) context.stroke();
+    context.stroke();
   }
 
   const toScreen = ([x, y, , w]) => [(0.5 + (0.5 * x) / w) * canvas.width, (0.5 - (0.5 * y) / w) * canvas.height];
@@ -28,31 +30,63 @@ function createCanvasRenderer(canvas) {
     });
   }
 
+  /** Colour as the four bytes of a picture element, in one little-endian word. */
   function shade(colour, normal, frame, tone) {
     const lit = Math.max(dot(normal, frame.light), 0);
     const bright = tone * (AMBIENT[0] + AMBIENT[1] * dot(normal, frame.up) + DIFFUSE * lit);
-    return css(colour.map((c) => Math.sqrt(Math.min(c * c * bright, 1))));
+    const [red, green, blue] = colour.map((c) => Math.round(255 * Math.sqrt(Math.min(c * c * bright, 1))));
+    return ((255 << 24) | (blue << 16) | (green << 8) | red) >>> 0;
   }
 
+  /** Fills a triangle of screen points [x, y, nearness] where it is nearer than what `layer` holds. */
+  function fillTriangle([a, b, c], word, { width, height, nearness, words }) {
+    const area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+    if (area === 0) return;
+    const clamp = (value, limit) => Math.min(Math.max(value, 0), limit);
+    const top = clamp(Math.ceil(Math.min(a[1], b[1], c[1]) - 0.5), height);
+    const bottom = clamp(Math.ceil(Math.max(a[1], b[1], c[1]) - 0.5), height);
+    const left = clamp(Math.ceil(Math.min(a[0], b[0], c[0]) - 0.5), width);
+    const right = clamp(Math.ceil(Math.max(a[0], b[0], c[0]) - 0.5), width);
+    for (let row = top; row < bottom; row++)
+      for (let column = left; column < right; column++) {
+        const [x, y] = [column + 0.5, row + 0.5];
+        const shareC = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area;
+        const shareB = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area;
+        const shareA = 1 - shareB - shareC;
+        if (shareA < 0 || shareB < 0 || shareC < 0) continue;
+        const near = shareA * a[2] + shareB * b[2] + shareC * c[2];
+        const place = row * width + column;
+        if (near <= nearness[place]) continue;
+        nearness[place] = near;
+        words[place] = word;
+      }
+  }
+
+  /** Draws solids over the canvas, each hidden by the nearer ones of the same call. */
   function drawSolids(items, frame) {
-    const faces = [];
+    if (!items.length) return;
+    const { width, height } = canvas;
+    const picture = new ImageData(width, height);
+    const layer = { width, height, nearness: new Float32Array(width * height), words: new Uint32Array(picture.data.buffer) };
     for (const { mesh, matrix, colour } of items) {
       const world = mesh.points.map((point) => transform(matrix, point).slice(0, 3));
-      const screen = world.map((point) => transform(frame.viewProjection, point));
+      const clip = world.map((point) => transform(frame.viewProjection, point));
+      // One over the depth is linear on the screen, the depth is not.
+      const screen = clip.map((corner) => [...toScreen(corner), 1 / corner[3]]);
       for (const triangle of mesh.triangles) {
-        const corners = triangle.map((i) => screen[i]);
-        if (corners.some((corner) => corner[3] <= frame.near)) continue;
+        if (triangle.some((i) => clip[i][3] <= frame.near)) continue;
         const [a, b, c] = triangle.map((i) => world[i]);
         const normal = normalize(cross(subtract(b, a), subtract(c, a)));
         if (dot(normal, subtract(frame.eye, a)) <= 0) continue;
         const [x, y, z] = [0, 1, 2].map((axis) => triangle.reduce((sum, i) => sum + mesh.points[i][axis], 0));
         const tone = mesh.octants && x * y * z < 0 ? DARK_OCTANT : 1;
-        const depth = corners[0][3] + corners[1][3] + corners[2][3];
-        faces.push({ depth, points: corners.map(toScreen), fill: shade(colour, normal, frame, tone) });
+        fillTriangle(triangle.map((i) => screen[i]), shade(colour, normal, frame, tone), layer);
       }
     }
-    faces.sort((p, q) => q.depth - p.depth);
-    for (const face of faces) polygon(face.points, face.fill);
+    sheet.width = width;
+    sheet.height = height;
+    sheet.getContext("2d").putImageData(picture, 0, 0);
+    context.drawImage(sheet, 0, 0);
   }
 
   function drawPlane(plane, frame) {

@@ -1,15 +1,19 @@
 // Camera that circles a point: drag turns, shift-drag or right-drag pans, wheel or pinch zooms.
 
+// The controls cover the lower edge: the scene starts a little smaller and is shown a little higher.
+const FIRST_ZOOM = 1.18;
+const RAISED = 0.08;
+
 function createOrbitCamera(data, canvas, changed) {
   const [right, up, front] = data.basis;
   const { view } = data;
-  const camera = { anchor: view.target, pan: [0, 0, 0], yaw: 0, pitch: 0, distance: view.distance };
+  const camera = { anchor: view.target, pan: [0, 0, 0], yaw: 0, pitch: 0, distance: FIRST_ZOOM * view.distance };
 
   function reset() {
     const { direction } = view;
     camera.yaw = Math.atan2(dot(direction, right), dot(direction, front));
     camera.pitch = Math.asin(Math.min(Math.max(dot(direction, up), -1), 1));
-    camera.distance = view.distance;
+    camera.distance = FIRST_ZOOM * view.distance;
     camera.pan = [0, 0, 0];
     changed();
   }
@@ -77,6 +81,7 @@ function createOrbitCamera(data, canvas, changed) {
     const half = Math.atan(Math.tan(view.fieldOfView / 2) / Math.min(aspect, 1));
     const near = 0.02 * camera.distance;
     const projection = perspective(2 * half, aspect, near, camera.distance + 80 * view.radius);
+    projection[9] = -RAISED;
     const world = lookAt(eye(), target(), up);
     return { eye: eye(), target: target(), near, viewProjection: multiply(projection, world) };
   }
