@@ -9,7 +9,7 @@ from jax import Array
 
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Mat3, Vec3, multiply
 from mathota_jax.state import State
@@ -48,12 +48,12 @@ class Bodies(NamedTuple):
 
 def vector(array: Array) -> Vec3:
     """Components of an (element, 3, world) array."""
-    return Vec3(array[:, 0], array[:, 1], array[:, 2])
+    return Vec3(*unstack(array, 1))
 
 
 def quaternion(array: Array) -> Quaternion:
     """Components of an (element, 4, world) array."""
-    return Quaternion(array[:, 0], array[:, 1], array[:, 2], array[:, 3])
+    return Quaternion(*unstack(array, 1))
 
 
 def unpack(state: State) -> Bodies:
@@ -84,5 +84,5 @@ def pack_blocks(linear: Vec3, angular: Vec3 | None) -> Array:
 
 def unpack_blocks(velocity: Array) -> tuple[Vec3, Vec3 | None]:
     """Linear and angular part of blocks."""
-    linear = Vec3(velocity[0], velocity[1], velocity[2])
-    return linear, Vec3(velocity[3], velocity[4], velocity[5]) if velocity.shape[0] == 6 else None
+    components = unstack(velocity, 0)
+    return Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None

@@ -208,6 +208,7 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
         force = contact.matched_force(
             model.scene, problem.contacts, vector(state.contact_force), state.contact_feature
         )
+        force = compute_once(force, state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
     return tuple(start)
 
@@ -222,7 +223,7 @@ def _solve(scene: Scene, problem: _Problem, velocity: Array, start: tuple[Array,
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
-    return scene.options.gradient_iterations or 2 * iterations
+    return scene.options.gradient_iterations or iterations
 
 
 def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:

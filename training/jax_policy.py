@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -45,7 +46,7 @@ class JaxPolicy:
 
     def save(self, directory: Path) -> None:
         """Write the arrays to ``directory``."""
-        arrays = {
+        arrays: dict[str, Any] = {
             "observation_mean": self.observation_mean,
             "observation_variance": self.observation_variance,
             "action_low": self.bounds.low,

@@ -200,7 +200,7 @@ class PPO:
             parameters, optimizer_state = carry
             gradients, losses = jax.grad(self._loss, has_aux=True)(parameters, minibatch)
             updates, optimizer_state = self.optimizer.update(gradients, optimizer_state, parameters)
-            return (optax.apply_updates(parameters, updates), optimizer_state), losses
+            return (jax.tree.map(jnp.add, parameters, updates), optimizer_state), losses
 
         def epoch(carry: tuple[Parameters, Any], epoch_key: Array) -> tuple[tuple[Parameters, Any], Any]:
             order = jax.random.permutation(epoch_key, sample_count)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from mathota_envs.sb3 import SB3VecEnv
@@ -60,8 +61,9 @@ def train(
         device="cpu",
     )
     try:
-        model.learn(hyperparameters.steps, callback=_Progress(hyperparameters, report, should_stop))
-        return _policy(model)
+        progress = _Progress(hyperparameters, report, lambda: should_stop(_policy(model, vector_environment)))
+        model.learn(hyperparameters.steps, callback=progress)
+        return _policy(model, vector_environment)
     finally:
         vector_environment.close()
 
@@ -73,7 +75,7 @@ class _Progress(BaseCallback):
         self,
         hyperparameters: Hyperparameters,
         report: Callable[[int, float, int], None],
-        should_stop: Callable[[SB3Policy], bool],
+        should_stop: Callable[[], bool],
     ) -> None:
         super().__init__()
         self._report = report
@@ -86,7 +88,7 @@ class _Progress(BaseCallback):
     def _on_rollout_start(self) -> None:
         # Here and not at the end of a rollout: the policy that is judged must be the one that is kept.
         if self._updates and self._updates % self._interval == 0:
-            self._stop = self._should_stop(_policy(self.model))
+            self._stop = self._should_stop()
 
     def _on_step(self) -> bool:
         if self._stop:
@@ -102,10 +104,9 @@ class _Progress(BaseCallback):
         self._finished_returns = []
 
 
-def _policy(model: PPO) -> SB3Policy:
-    vector_environment = model.get_vec_normalize_env()
-    if vector_environment.norm_obs:
-        statistics = vector_environment.obs_rms
+def _policy(model: PPO, environment: VecNormalize) -> SB3Policy:
+    statistics = environment.obs_rms if environment.norm_obs else None
+    if isinstance(statistics, RunningMeanStd):
         return SB3Policy(model, statistics.mean.copy(), statistics.var.copy())
-    size = model.observation_space.shape
+    size = environment.observation_space.shape or ()
     return SB3Policy(model, np.zeros(size), np.ones(size))

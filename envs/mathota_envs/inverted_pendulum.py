@@ -51,7 +51,7 @@ class InvertedPendulum(SimulatedEnvironment):
     """
 
     frame_skip: int = 2
-    substeps: int = 2
+    substeps: int = 4
     reset_noise_scale: float = 0.01
 
     time_step: ClassVar[float] = 0.02

@@ -10,7 +10,7 @@ from jax import Array
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.scene import PairGroup, Scene
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3
@@ -61,7 +61,7 @@ def _group_contacts(
 
     def parameters(kind: str, rows: tuple[int, ...]) -> dict[str, Any]:
         return {
-            name: Vec3(values[:, 0], values[:, 1], values[:, 2]) if values.ndim == 3 else values
+            name: Vec3(*unstack(values, 1)) if values.ndim == 3 else values
             for name, values in take(shapes[kind], rows).items()
         }
 

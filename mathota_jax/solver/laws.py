@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array
 
+from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.struct import pytree
 
@@ -56,9 +57,9 @@ class Cone:
     def update(self, impulse: Array, error: Array) -> Array:
         """Normal row first, then the tangents with the normal's new impulse."""
         row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
-        old_n, old_1, old_2 = jnp.moveaxis(impulse, row, 0)
-        error_n, error_1, error_2 = jnp.moveaxis(error, row, 0)
-        coupling_1, coupling_2 = jnp.moveaxis(self.coupling, row, 0)
+        old_n, old_1, old_2 = unstack(impulse, row)
+        error_n, error_1, error_2 = unstack(error, row)
+        coupling_1, coupling_2 = unstack(self.coupling, row)
         normal = jnp.maximum(old_n - error_n * self.normal_mass, 0.0)
         change = normal - old_n
         free_1 = old_1 - (error_1 + coupling_1 * change) * self.tangent_mass

@@ -24,7 +24,7 @@ from jax import Array, lax
 
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.table import Table
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.settle import store
 from mathota_jax.struct import pytree, static
 
@@ -138,13 +138,13 @@ def _turn(update: Update, velocity: Array, blocks: tuple, receivers: object, val
 
 def _project(jacobian: Array, velocity: Array) -> Array:
     """``J v``: (..., row, component, column, world) times (component, ..., column, world)."""
-    terms = [jacobian[..., :, k, :, :] * velocity[..., None, k, :, :] for k in range(jacobian.shape[-3])]
+    terms = [j * v[..., None, :, :] for j, v in zip(unstack(jacobian, -3), unstack(velocity, -3), strict=True)]
     return functools.reduce(jnp.add, terms)
 
 
 def _respond(response: Array, impulse: Array) -> Array:
     """``M^-1 J^T`` times impulse: (component, column, world)."""
-    terms = [response[..., row, :, :, :] * impulse[..., row, None, :, :] for row in range(response.shape[-4])]
+    terms = [r * i[..., None, :, :] for r, i in zip(unstack(response, -4), unstack(impulse, -3), strict=True)]
     return functools.reduce(jnp.add, terms)
 
 
@@ -187,8 +187,9 @@ def _add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array
 
 def _add_responses(table: Table, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
     if table.turn_count <= UNROLLED_TURNS:
-        for turn in range(table.turn_count):
-            changes = [_respond(side[turn], impulse[turn]) for side in response]
+        by_turn = zip(*(unstack(side, 0) for side in response), unstack(impulse, 0), strict=True)
+        for turn, (*sides, values) in enumerate(by_turn):
+            changes = [_respond(side, values) for side in sides]
             velocity = _receive(velocity, table.receivers[turn], changes)
         return velocity
 

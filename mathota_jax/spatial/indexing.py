@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 
 def take(tree: Any, indices: Sequence[int] | np.ndarray, axis: int = 0) -> Any:
@@ -25,3 +26,13 @@ def take(tree: Any, indices: Sequence[int] | np.ndarray, axis: int = 0) -> Any:
             lambda x: x if stop - start == x.shape[axis] else jax.lax.slice_in_dim(x, start, stop, axis=axis), tree
         )
     return jax.tree.map(lambda x: jnp.take(x, index, axis=axis, unique_indices=False, mode="clip"), tree)
+
+
+def unstack(array: Array, axis: int) -> list[Array]:
+    """The slices of an array along `axis`, without that axis.
+
+    Indexing would do the same, but its transpose is a sum of padded arrays, each computed for every element; that of a
+    split is one concatenation.
+    """
+    parts = jax.lax.split(array, (1,) * array.shape[axis], axis=axis % array.ndim)
+    return [jnp.squeeze(part, axis) for part in parts]
