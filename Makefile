@@ -12,7 +12,7 @@ help:
 	@echo "make demo       install, train the pendulum, write the replay (runs/)"
 	@echo "make test       install, lint, type check, run the tests"
 	@echo "make test-slow  install, run the full sweeps"
-	@echo "make bench      install, measure speed against error (tests/benchmarks/results/)"
+	@echo "make bench      install, measure speed against error (tests/benchmarks/results/, README)"
 	@echo "make lint       install, ruff, pyright and import contracts only"
 	@echo "make format     install, format the sources"
 	@echo "Another interpreter: make demo PYTHON=python3.12"
@@ -28,6 +28,7 @@ test-slow: $(VENV)/test.stamp
 
 bench: $(VENV)/bench.stamp
 	$(RUN) -m tests.benchmarks
+	$(RUN) -m tests.status
 
 lint: $(VENV)/test.stamp
 	$(VENV)/bin/ruff check .
@@ -58,5 +59,5 @@ $(VENV)/test.stamp: pyproject.toml | $(VENV)/created.stamp
 	@touch $@ $(VENV)/train.stamp
 
 $(VENV)/bench.stamp: pyproject.toml | $(VENV)/created.stamp
-	$(INSTALL) -e ".[bench]"
-	@touch $@
+	$(INSTALL) -e ".[train,bench]"
+	@touch $@ $(VENV)/train.stamp

@@ -30,7 +30,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import take
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import Flag, State
 
@@ -116,7 +116,7 @@ class _Problem(NamedTuple):
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
     """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this."""
     scene = model.scene
-    bodies = compute_once(unpack(state), state.position)
+    bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
         return _finish(scene, state, bodies, bodies, None, None)
     blocks = moving(scene, bodies)

@@ -40,4 +40,4 @@ class ActionBounds:
     def from_unit(self, raw_action: Array) -> Array:
         """Clip to [-1, 1] and stretch to the bounds, ``(..., action) -> (..., action)``."""
         middle, half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
-        return middle + half_range * jnp.clip(raw_action, -1.0, 1.0)
+        return jnp.clip(raw_action, -1.0, 1.0) * half_range + middle

@@ -75,7 +75,9 @@ class JaxPolicy:
 
 
 @jax.jit
-def _mean_action(layers, observation_mean, observation_variance, low, high, observations):
+def _mean_action(
+    layers: Any, observation_mean: Any, observation_variance: Any, low: Any, high: Any, observations: Any
+) -> jax.Array:
     moments = RunningMoments(observation_mean, observation_variance, jnp.zeros(()))
     mean = action_mean({"actor": layers}, normalize(moments, observations))
     return ActionBounds(low, high).from_unit(mean)

@@ -18,6 +18,7 @@ from mathota_jax import (
     Hinge,
     Model,
     Options,
+    Plane,
     SceneBuilder,
     Sphere,
     State,
@@ -84,6 +85,7 @@ class BallBalance(SimulatedEnvironment):
         builder.add_body(Box(PLATE_HALF_EXTENTS), mass=0.6, position=PIVOT, friction=0.9, name="plate")
         above = (PIVOT[0], PIVOT[1] + PLATE_HALF_EXTENTS[1] + BALL_RADIUS, PIVOT[2])
         builder.add_body(Sphere(BALL_RADIUS), mass=0.1, position=above, friction=0.9, name="ball")
+        builder.add_body(Plane((0.0, 1.0, 0.0), 0.0), static=True, collides=False, name="ground")  # only to look at
         for joint, name in ((TILT_X, "tilt x"), (TILT_Z, "tilt z")):
             builder.add_motor(builder.add_joint(joint, name=name), kind="torque", limit=1.0, gear=0.5)
         return builder.build(Options(dt=self.engine_step))

@@ -127,9 +127,8 @@ def step_or_restart(environment: Any, worlds: Worlds, action: Array, restart: Ar
     Returns:
         The worlds and the transition: with reward 0, not done and the first observation where a world restarted.
     """
-    stepped, transition = step_worlds(environment, worlds, action)
-    # A restarted world must come from the state before the step: stepping a finished world means nothing.
-    worlds = _restart_if_any(environment, select_worlds(restart, worlds, stepped), restart)
+    worlds, transition = step_worlds(environment, worlds, action)
+    worlds = _restart_if_any(environment, worlds, restart)
     return worlds, transition._replace(
         observation=worlds.observation,
         reward=jnp.where(restart, 0.0, transition.reward),

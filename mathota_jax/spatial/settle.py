@@ -58,3 +58,16 @@ def store(value: Array, source: Array) -> Array:
             so the divisor needs the full shape.)
     """
     return value / (lax.stop_gradient(source) * 0 + 1)
+
+
+def materialize(values: Any) -> Any:
+    """Stores every array of a pytree, and in reverse mode its cotangent, before anything else reads it.
+
+    `compute_once` can not help where a single consumer is the problem: a concatenation of long expressions is compiled
+    to one kernel that branches for every element. A conditional is never fused. Its predicate is true: no square is
+    2 or 3 modulo 4.
+    """
+    first = jax.tree.leaves(values)[0]
+    bits = lax.bitcast_convert_type(first.reshape(-1)[0].astype(jnp.float32), jnp.int32)
+    always = (bits * bits) & 3 < 2
+    return lax.cond(always, lambda tree: tree, lambda tree: jax.tree.map(jnp.negative, tree), values)

@@ -144,7 +144,7 @@ def slide_to_roll() -> dict:
     distance = speed * seconds / 1.4 + 0.5 * (0.4 / 1.4) ** 2 * speed**2 / (friction * GRAVITY)
     return {
         "rolling speed, relative error": _gate(np.abs(velocity[rolling] / rolled_speed - 1).max(), 1e-4),
-        "slip |v - r w| [m/s]": _gate(np.abs(velocity - radius * spin)[rolling].max(), 1e-4),
+        "slip v - r w [m/s]": _gate(np.abs(velocity - radius * spin)[rolling].max(), 1e-4),
         "distance at 2 s, relative error": _figure(abs(float(track.position[-1, BODY, 0]) / distance - 1)),
         "settings": {"dt": TIME_STEP, "precision": "float32"},
         "cpu_seconds": cpu,

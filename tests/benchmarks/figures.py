@@ -164,13 +164,17 @@ def _compile_time(result: dict) -> Iterator[Figure]:
 
 def _accuracy(result: dict) -> Iterator[Figure]:
     for scene, values in result.items():
-        rest = ", ".join(f"{name} {_text(value)}" for name, value in values["settings"].items())
+        rest = ", ".join(f"{name} {_setting(name, value)}" for name, value in values["settings"].items())
         settings = f"{rest}; {values['cpu_seconds']:.2g} CPU-seconds"
         for name, entry in values.items():
             if name in ("settings", "cpu_seconds"):
                 continue
             limit = _text(entry["gate"]) if "gate" in entry else ""
             yield Figure(f"{SCENE_TITLES[scene]}: {name}", _text(entry["value"]), limit, entry.get("met"), settings)
+
+
+def _setting(name: str, value: object) -> str:
+    return f"1/{1 / value:.0f} s" if name == "dt" and isinstance(value, float) else _text(value)
 
 
 def _text(value: object) -> str:

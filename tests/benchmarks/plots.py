@@ -14,7 +14,7 @@ def speed_error(points: dict, path: pathlib.Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     figure, panels = pyplot.subplots(1, len(points), figsize=(6 * len(points), 4.5), layout="constrained")
     for panel, (scene, entries) in zip(panels, points.items(), strict=True):
@@ -31,6 +31,7 @@ def speed_error(points: dict, path: pathlib.Path) -> None:
             xlabel="CPU-seconds per simulated second and world",
             ylabel="largest relative error over the worlds",
         )
+        panel.xaxis.set_minor_formatter(ticker.NullFormatter())
         panel.grid(True, which="both", alpha=0.3)
         panel.legend(fontsize=8)
     figure.savefig(path, dpi=110)

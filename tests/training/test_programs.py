@@ -50,12 +50,12 @@ def test_earlier_runs_are_not_overwritten(tmp_path, capsys):
 @pytest.mark.parametrize("backend", ["sb3", "jax"])
 def test_short_run_writes_everything(backend, tmp_path, capsys):
     folder = tmp_path / "run"
-    sizes = ["--worlds", "4", "--steps", "256", "--eval-episodes", "2"]
+    sizes = ["--worlds", "4", "--steps", "240", "--eval-episodes", "2"]
     arguments = ["--env", ENVIRONMENT_ID, "--backend", backend, *sizes, "--output", str(folder)]
     assert train.main(arguments) == 0
     printed = capsys.readouterr().out
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["steps"] == 256
+    assert metrics["steps"] == 240
     assert metrics["evaluation"]["episodes"] == 2
     assert 1 <= metrics["evaluation"]["mean_return"] <= 1000
     assert metrics["evaluation"]["mean_length"] >= metrics["evaluation"]["mean_return"]
