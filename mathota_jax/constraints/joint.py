@@ -63,7 +63,7 @@ def joint_tables(scene: Scene) -> tuple[Table, ...]:
             slots = tuple(start + row * len(group.joints) + place for row in range(group.row_count))
             constraints.append(Constraint(blocks, slots))
         start += group.row_count * len(group.joints)
-    return make_tables(constraints, len(block_of))
+    return make_tables(constraints, len(block_of), together=False)
 
 
 class JointRows(NamedTuple):

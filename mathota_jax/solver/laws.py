@@ -39,19 +39,17 @@ class Bounded:
 class Cone:
     """Contact with isotropic Coulomb friction: rows normal, first tangent, second tangent.
 
-    The tangential step uses one scalar mass for both tangents (the inverse of the largest eigenvalue of their block), so
-    that a sliding contact's fixed point opposes the sliding velocity exactly: friction is a disc, not a box.
+    The tangential step uses one scalar mass for both tangents, so that a sliding contact's fixed point opposes the
+    sliding velocity exactly: friction is a disc, not a box.
 
     Attributes:
       normal_mass: effective mass of the normal row.
       tangent_mass: common effective mass of the tangent rows.
-      coupling: (2, ...) tangential velocity caused by a unit normal impulse.
       friction: Coulomb coefficient.
     """
 
     normal_mass: Array
     tangent_mass: Array
-    coupling: Array
     friction: Array
 
     def update(self, impulse: Array, error: Array) -> Array:
@@ -59,11 +57,9 @@ class Cone:
         row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
         old_n, old_1, old_2 = unstack(impulse, row)
         error_n, error_1, error_2 = unstack(error, row)
-        coupling_1, coupling_2 = unstack(self.coupling, row)
         normal = jnp.maximum(old_n - error_n * self.normal_mass, 0.0)
-        change = normal - old_n
-        free_1 = old_1 - (error_1 + coupling_1 * change) * self.tangent_mass
-        free_2 = old_2 - (error_2 + coupling_2 * change) * self.tangent_mass
+        free_1 = old_1 - error_1 * self.tangent_mass
+        free_2 = old_2 - error_2 * self.tangent_mass
         squared = free_1 * free_1 + free_2 * free_2
         limit = self.friction * normal
         sliding = squared > limit * limit

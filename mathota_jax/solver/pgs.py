@@ -112,19 +112,21 @@ def _sweep(
             blocks = tuple(side[turn] for side in table.blocks)
             receivers = table.receivers[turn]
             at_turn = jax.tree.map(lambda x, turn=turn: x[turn], scanned)
-            velocity, at_turn = _turn(update, velocity, blocks, receivers, at_turn)
+            velocity, at_turn = _turn(update, table.together, velocity, blocks, receivers, at_turn)
             new.append(at_turn)
         return velocity, jnp.stack(new)
 
     def body(velocity: Array, at_turn: tuple) -> tuple[Array, Array]:
         blocks, receivers, values = at_turn
-        return _turn(update, velocity, blocks, receivers, values)
+        return _turn(update, table.together, velocity, blocks, receivers, values)
 
     indices = tuple(jnp.asarray(side, jnp.int32) for side in table.blocks)
     return lax.scan(body, velocity, (indices, jnp.asarray(table.receivers), scanned))
 
 
-def _turn(update: Update, velocity: Array, blocks: tuple, receivers: object, values: tuple) -> tuple[Array, Array]:
+def _turn(
+    update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
+) -> tuple[Array, Array]:
     """Solves the rows of one turn side by side."""
     jacobian, response, bias, coefficients, impulse = values
     error = bias
@@ -133,7 +135,7 @@ def _turn(update: Update, velocity: Array, blocks: tuple, receivers: object, val
     new = update(coefficients, impulse, error)
     # Stored, because every later row of the sweep depends on it: a chain of rows must not be computed again for each.
     new = store(new, response[0][:, 0])
-    return _receive(velocity, receivers, [_respond(side, new - impulse) for side in response]), new
+    return _receive(velocity, receivers, [_respond(side, new - impulse, together) for side in response]), new
 
 
 def _project(jacobian: Array, velocity: Array) -> Array:
@@ -142,10 +144,13 @@ def _project(jacobian: Array, velocity: Array) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def _respond(response: Array, impulse: Array) -> Array:
-    """``M^-1 J^T`` times impulse: (component, column, world)."""
+def _respond(response: Array, impulse: Array, together: int) -> Array:
+    """``M^-1 J^T`` times impulse, summed over the rows and columns of each constraint: (component, constraint, world)."""
     terms = [r * i[..., None, :, :] for r, i in zip(unstack(response, -4), unstack(impulse, -3), strict=True)]
-    return functools.reduce(jnp.add, terms)
+    total = functools.reduce(jnp.add, terms)
+    if together == 1:
+        return total
+    return functools.reduce(jnp.add, unstack(total.reshape(total.shape[0], -1, together, total.shape[-1]), 2))
 
 
 def _gather(velocity: Array, blocks: object) -> Array:
@@ -157,7 +162,7 @@ def _gather(velocity: Array, blocks: object) -> Array:
 
 
 def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
-    """Adds to each block the change of the column that acts on it."""
+    """Adds to each block the change by the constraint that acts on it."""
     block_count = velocity.shape[1]
     if block_count == 1 and len(changes) == 1 and changes[0].shape[1] == 1:
         return velocity + changes[0]
@@ -189,13 +194,13 @@ def _add_responses(table: Table, response: tuple[Array, ...], velocity: Array, i
     if table.turn_count <= UNROLLED_TURNS:
         by_turn = zip(*(unstack(side, 0) for side in response), unstack(impulse, 0), strict=True)
         for turn, (*sides, values) in enumerate(by_turn):
-            changes = [_respond(side, values) for side in sides]
+            changes = [_respond(side, values, table.together) for side in sides]
             velocity = _receive(velocity, table.receivers[turn], changes)
         return velocity
 
     def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
         receivers, sides, values = at_turn
-        return _receive(velocity, receivers, [_respond(side, values) for side in sides]), None
+        return _receive(velocity, receivers, [_respond(side, values, table.together) for side in sides]), None
 
     return lax.scan(body, velocity, (jnp.asarray(table.receivers), response, impulse))[0]
 

@@ -1,7 +1,8 @@
 """Order in which a sweep visits the rows, fixed at build time: turns of rows that share no moving body.
 
 Rows of one turn are solved side by side as one vector operation; turns follow one another. A greedy colouring of the
-constraints gives the turns: two constraints may share a colour if they share no moving body.
+constraints gives the turns: two constraints may share a colour if they share no moving body. The rows of one constraint
+follow one another too, unless they are solved *together*: then they share the turn, and their law must bound the step.
 """
 
 from __future__ import annotations
@@ -31,11 +32,13 @@ class Table:
       slots: (turn, column) slot solved there, EMPTY for padding.
       blocks: for each side, (turn, column) velocity block; padding points at block `block_count`, which does not exist.
       block_count: number of velocity blocks.
+      together: number of neighbouring columns that belong to one constraint.
     """
 
     slots: tuple[tuple[int, ...], ...]
     blocks: tuple[tuple[tuple[int, ...], ...], ...]
     block_count: int
+    together: int
 
     @property
     def turn_count(self) -> int:
@@ -49,28 +52,39 @@ class Table:
 
     @functools.cached_property
     def receivers(self) -> np.ndarray:
-        """(turn, block) column of the concatenated sides whose impulse the block gets; the one past the end for none."""
-        columns = len(self.slots[0])
-        receivers = np.full((self.turn_count, self.block_count + 1), len(self.blocks) * columns, np.int32)
+        """(turn, block) constraint of the concatenated sides whose impulse the block gets; one past the end for none."""
+        constraints = len(self.slots[0]) // self.together
+        receivers = np.full((self.turn_count, self.block_count + 1), len(self.blocks) * constraints, np.int32)
         for side, blocks in enumerate(self.blocks):
             for turn, row in enumerate(blocks):
-                receivers[turn, list(row)] = side * columns + np.arange(columns)
+                receivers[turn, list(row[:: self.together])] = side * constraints + np.arange(constraints)
         return receivers[:, : self.block_count]
 
 
-def make_tables(constraints: Sequence[Constraint], block_count: int) -> tuple[Table, ...]:
-    """Tables that together visit every slot once: first the one-sided constraints, then the two-sided."""
+def make_tables(constraints: Sequence[Constraint], block_count: int, together: bool) -> tuple[Table, ...]:
+    """Tables that together visit every slot once: first the one-sided constraints, then the two-sided.
+
+    Args:
+      constraints: in the order in which they are to be visited.
+      block_count: number of velocity blocks.
+      together: whether the rows of a constraint are solved in one turn or one after the other.
+    """
     tables = []
     for side_count in (1, 2):
         chosen = [constraint for constraint in constraints if len(constraint.blocks) == side_count]
         if chosen:
-            tables.append(_make_table(chosen, side_count, block_count))
+            tables.append(_make_table(chosen, side_count, block_count, together))
     return tuple(tables)
 
 
-def _make_table(constraints: list[Constraint], side_count: int, block_count: int) -> Table:
+def _make_table(constraints: list[Constraint], side_count: int, block_count: int, together: bool) -> Table:
     turns: list[list[tuple[int, tuple[int, ...]]]] = []
+    count = max(len(constraint.slots) for constraint in constraints) if together else 1
     for colour in _colour(constraints):
+        if together:
+            padded_slots = [(c, [*c.slots, *[EMPTY] * (count - len(c.slots))]) for c in colour]
+            turns.append([(slot, c.blocks) for c, slots in padded_slots for slot in slots])
+            continue
         for row in range(max(len(constraint.slots) for constraint in colour)):
             turns.append([(c.slots[row], c.blocks) for c in colour if row < len(c.slots)])
     width = max(len(turn) for turn in turns)
@@ -80,6 +94,7 @@ def _make_table(constraints: list[Constraint], side_count: int, block_count: int
         slots=tuple(tuple(slot for slot, _ in turn) for turn in padded),
         blocks=tuple(tuple(tuple(blocks[side] for _, blocks in turn) for turn in padded) for side in range(side_count)),
         block_count=block_count,
+        together=count,
     )
 
 
