@@ -217,8 +217,7 @@ class PPO:
         mean = action_mean(parameters, samples.observation)
         ratio = jnp.exp(log_probability(mean, log_standard_deviation, samples.action) - samples.log_probability)
         advantage = (samples.advantage - samples.advantage.mean()) / (samples.advantage.std() + 1e-8)
-        clipped_ratio = jnp.clip(ratio, 1 - hyperparameters.clip_range, 1 + hyperparameters.clip_range)
-        policy_loss = -jnp.minimum(ratio * advantage, clipped_ratio * advantage).mean()
+        policy_loss = -clipped_objective(ratio, advantage, hyperparameters.clip_range).mean()
         value_loss = jnp.mean((state_value(parameters, samples.observation) - samples.value_target) ** 2)
         loss = (
             policy_loss
@@ -267,6 +266,17 @@ def train(
         if should_stop(learner.policy(state)):
             break
     return learner.policy(state)
+
+
+def clipped_objective(ratio: Array, advantage: Array, clip_range: float) -> Array:
+    """PPO's objective of each sample: no reward for moving a probability further than the clip range.
+
+    Args:
+        ratio: New over old probability of the action.
+        advantage: Of the action.
+        clip_range: Largest change of the ratio from 1 that pays.
+    """
+    return jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - clip_range, 1 + clip_range) * advantage)
 
 
 def _metrics(steps: Steps, losses: tuple[Array, ...], parameters: Parameters) -> UpdateMetrics:

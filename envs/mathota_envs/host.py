@@ -7,7 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Space
 from gymnasium.utils import seeding
 from jax import Array
 
@@ -27,7 +27,7 @@ def writable(array: Array, dtype: Any = None) -> np.ndarray:
     return np.array(array, dtype=dtype)
 
 
-def checked_actions(actions: Any, space: Box, name: str) -> np.ndarray:
+def checked_actions(actions: Any, space: Space[Any], name: str) -> np.ndarray:
     """Actions as an array of the space's shape and type.
 
     Raises:

@@ -88,9 +88,9 @@ class InvertedPendulum(SimulatedEnvironment):
     def start(self, key: Array, options: dict[str, Array]) -> tuple[State, Any]:
         """Random joint coordinates and rates, or those of the options."""
         scale = self.reset_noise_scale
-        position, velocity = jax.random.uniform(key, (2, 2), minval=-scale, maxval=scale)
-        position = options.get("joint_position", position)
-        velocity = options.get("joint_velocity", velocity)
+        noise = jax.random.uniform(key, (2, 2), minval=-scale, maxval=scale)
+        position = options.get("joint_position", noise[0])
+        velocity = options.get("joint_velocity", noise[1])
         return place(self.rest_state, (SLIDER, HINGE), position, velocity), ()
 
     def observe(self, model: Model, env_state: EnvState) -> Array:

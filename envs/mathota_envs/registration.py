@@ -65,13 +65,10 @@ def register_environments() -> None:
     environments get the limit as an option. Each episode is thus counted once.
     """
     for id, environment_class in ENVIRONMENTS.items():
-        default_limit = next(
-            field.default for field in dataclasses.fields(environment_class) if field.name == "max_episode_steps"
-        )
         gymnasium.register(
             id,
             entry_point="mathota_envs.gym_env:make_without_time_limit",
             vector_entry_point="mathota_envs.vector_env:GymVectorEnv",
-            max_episode_steps=default_limit,
+            max_episode_steps=environment_class.max_episode_steps,
             kwargs={"environment": id},
         )

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gymnasium
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -96,24 +97,21 @@ class SB3VecEnv(VecEnv):
         Raises:
             ValueError: an option is unknown, has the wrong shape or is not finite.
         """
-        options = [checked_reset_options(self.environment, single) for single in self._options]
+        options = [checked_reset_options(self.environment, single) or {} for single in self._options]
         key = self._next_keys()
-        self.worlds = start_worlds(self.environment, key)
+        worlds = start_worlds(self.environment, key)
         for names in {tuple(sorted(single)) for single in options if single}:
-            mask = np.array([single is not None and tuple(sorted(single)) == names for single in options])
-            template = options[int(np.argmax(mask))]
-            stacked = {
-                name: jnp.stack(
-                    [(single if chosen else template)[name] for single, chosen in zip(options, mask, strict=True)]
-                )
-                for name in names
-            }
-            self.worlds = restart_worlds(self.environment, self.worlds, mask, key, stacked)
+            mask = np.array([tuple(sorted(single)) == names for single in options])
+            # Worlds outside the mask need some values of the right shape.
+            rows = [single if chosen else options[mask.argmax()] for single, chosen in zip(options, mask, strict=True)]
+            stacked = jax.tree.map(lambda *values: jnp.stack(values), *rows)
+            worlds = restart_worlds(self.environment, worlds, mask, key, stacked)
+        self.worlds = worlds
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         self._pending = None
-        return writable(self.worlds.observation, self.observation_space.dtype)
+        return writable(worlds.observation, self.observation_space.dtype)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Starts the step on the device; `step_wait` fetches it.

@@ -114,13 +114,14 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         single_options = checked_reset_options(self.environment, options)
         world_options = repeated(single_options, self.num_envs)
         key = self._checked_keys(seed)
-        if mask is None or mask.all():
-            self.worlds = start_worlds(self.environment, key, world_options)
+        if self.worlds is None or mask is None:
+            worlds = start_worlds(self.environment, key, world_options)
             self._done[:] = False
         else:
-            self.worlds = restart_worlds(self.environment, self.worlds, mask, key, world_options)
+            worlds = restart_worlds(self.environment, self.worlds, mask, key, world_options)
             self._done[mask] = False
-        return writable(self.worlds.observation, self.single_observation_space.dtype), {}
+        self.worlds = worlds
+        return writable(worlds.observation, self.single_observation_space.dtype), {}
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advances every world by one control interval, or restarts it where the autoreset mode says so.
@@ -143,16 +144,17 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         restarted = np.zeros(self.num_envs, bool)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             restarted = self._done
-            self.worlds, transition = step_or_restart(self.environment, self.worlds, actions, restarted)
+            worlds, transition = step_or_restart(self.environment, self.worlds, actions, restarted)
         elif self.autoreset_mode is AutoresetMode.SAME_STEP:
-            self.worlds, transition = step_then_restart(self.environment, self.worlds, actions)
+            worlds, transition = step_then_restart(self.environment, self.worlds, actions)
         else:
             if self._done.any():
                 raise ResetNeeded(
                     f"worlds {np.flatnonzero(self._done).tolist()} are finished: with autoreset_mode DISABLED call "
                     'reset(options={"reset_mask": terminations | truncations}) before the next step'
                 )
-            self.worlds, transition = step_worlds(self.environment, self.worlds, actions)
+            worlds, transition = step_worlds(self.environment, self.worlds, actions)
+        self.worlds = worlds
         terminations, truncations = writable(transition.terminated), writable(transition.truncated)
         self._done = terminations | truncations
         if self.autoreset_mode is AutoresetMode.SAME_STEP:
@@ -160,7 +162,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             infos = _masked_infos(transition.info, ~restarted)
         return (
-            writable(self.worlds.observation, self.single_observation_space.dtype),
+            writable(worlds.observation, self.single_observation_space.dtype),
             writable(transition.reward, np.float64),
             terminations,
             truncations,

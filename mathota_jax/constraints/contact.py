@@ -25,8 +25,12 @@ from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import Constraint, Table, make_tables
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
+
+
+RELAXATION = 4 / 3
+"""Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
 
 
 class Motion(NamedTuple):
@@ -85,9 +89,10 @@ def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet,
     jacobians, responses, start, free = [], [], jnp.zeros(()), jnp.zeros(())
     for side, sign in enumerate(_signs(scene, table)):
         inertia = select_blocks(table, side, motion.inertia)
-        arm = chosen.position - select_blocks(table, side, motion.position)
+        arm = compute_once(chosen.position - select_blocks(table, side, motion.position), chosen.separation)
         jacobian = [
-            Side(direction * sign, cross(arm, direction) * sign if rotating else None) for direction in directions
+            Side(direction * sign, compute_once(cross(arm, direction) * sign, arm.x) if rotating else None)
+            for direction in directions
         ]
         jacobians.append(jacobian)
         responses.append([respond(row, inertia) for row in jacobian])
@@ -134,7 +139,8 @@ def _row_bound(
 
     The points of a manifold are solved together, which keeps the symmetry of a stack: solved one after the other they
     tilt it. A step divided by the sum of the norms of the blocks ``J_i M^-1 J_j^T`` over j can not overshoot
-    (Gershgorin). A point alone gets its exact effective mass.
+    (Gershgorin); the steps are lengthened by a constant, which is safe below 2. A point alone gets its exact effective
+    mass.
     """
     count = table.together
 
@@ -146,6 +152,8 @@ def _row_bound(
 
         return jax.tree.map(roll, tree)
 
+    # The length of a step does not move the fixed point: its derivative is not worth computing.
+    jacobians, responses = jax.lax.stop_gradient((jacobians, responses))
     total = jnp.zeros(())
     for shift in range(count):
         squared = jnp.zeros(())
@@ -158,7 +166,7 @@ def _row_bound(
                 squared = squared + block * block
         norm_of_block = safe_sqrt(squared)
         total = total + (norm_of_block if shift == 0 else norm_of_block * others(active, shift))
-    return total
+    return total if count == 1 else total / RELAXATION
 
 
 def _push_only(effective_mass: Array) -> Bounded:
@@ -184,7 +192,8 @@ def _impact(
     gap = jnp.maximum(contacts.separation, 0.0)
     hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(contacts.separation <= 0, 1.0, 0.0)) > 0
     time = jnp.clip(jnp.where(hits & (start < 0), gap / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
-    target = jnp.where(hits, 0.0, -gap / dt)
+    # The gap changes by dt (start + end) / 2, so this end velocity closes it and no more.
+    target = jnp.where(hits, 0.0, -2.0 * gap / dt - start)
     impact = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
     # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
     share = safe_divide(impact, impact + norm(motion.gravity) * dt)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -134,7 +135,9 @@ def velocity_rows(scene: Scene, table: Table, model: Model, joints: JointRows, i
     moves = ~damped | (decay > 0)
     softness = jnp.where(damped & (decay > 0), mass / jnp.expm1(jnp.where(decay > 0, decay, 1.0)), 0.0)
     law = Bounded(
-        effective_mass=pack_scalars(table, [jnp.where(moves, 1.0 / (mass + softness), 0.0)], worlds),
+        effective_mass=jax.lax.stop_gradient(
+            pack_scalars(table, [jnp.where(moves, 1.0 / (mass + softness), 0.0)], worlds)
+        ),
         softness=pack_scalars(table, [softness], worlds),
         lower=_bounds(table, np.where(one_sided, 0.0, -np.inf)),
         upper=_bounds(table, np.full(one_sided.shape, np.inf)),
@@ -150,7 +153,7 @@ def position_rows(scene: Scene, table: Table, joints: JointRows, error: Array, i
     worlds = max(mass.shape[-1], error.shape[-1])
     free = np.where(damped, 0.0, np.inf)
     law = Bounded(
-        effective_mass=pack_scalars(table, [1.0 / mass], worlds),
+        effective_mass=jax.lax.stop_gradient(pack_scalars(table, [1.0 / mass], worlds)),
         softness=_bounds(table, np.zeros(one_sided.shape)),
         lower=_bounds(table, np.where(one_sided, 0.0, -free)),
         upper=_bounds(table, free),

@@ -36,8 +36,13 @@ def normalize(q: Quaternion) -> Quaternion:
 
 
 def to_matrix(q: Quaternion) -> Mat3:
-    """Rotation matrix of a unit quaternion (guide 1.2)."""
-    x2, y2, z2 = q.x + q.x, q.y + q.y, q.z + q.z
+    """Rotation matrix of a quaternion (guide 1.2), orthogonal to round-off whatever its length.
+
+    A stored unit quaternion is off by round-off, always to the same side for hours: taken as exact, its matrix shrinks
+    what it turns a little, and the angular momentum with it (measured: 1.2e-4 in 1000 steps in float32).
+    """
+    twice = 2.0 / (q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z)
+    x2, y2, z2 = q.x * twice, q.y * twice, q.z * twice
     wx, wy, wz = q.w * x2, q.w * y2, q.w * z2
     xx, xy, xz = q.x * x2, q.x * y2, q.x * z2
     yy, yz, zz = q.y * y2, q.y * z2, q.z * z2

@@ -5,12 +5,13 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+import scipy.stats
 
 from tests.training.toy_environments import ConstantReward, MatchTarget
 from training.evaluate import evaluate
-from training.networks import state_value
+from training.networks import entropy, log_probability, state_value
 from training.normalization import normalize
-from training.ppo import PPO, DivergedError, train
+from training.ppo import PPO, DivergedError, clipped_objective, train
 from training.presets import Hyperparameters
 
 SMALL = Hyperparameters(
@@ -20,6 +21,31 @@ SMALL = Hyperparameters(
 
 def ignore(*_):
     return False
+
+
+@pytest.mark.parametrize(
+    ("ratio", "advantage", "objective", "slope"),
+    [
+        (1.1, 2.0, 2.2, 2.0),  # within the range
+        (1.5, 2.0, 2.4, 0.0),  # a good action is already likelier: nothing more to gain
+        (0.5, 2.0, 1.0, 2.0),  # a good action became less likely: the way back is open
+        (0.5, -2.0, -1.6, 0.0),  # a bad action is already less likely
+        (1.5, -2.0, -3.0, -2.0),  # a bad action became likelier: the way back is open
+    ],
+)
+def test_clipped_objective(ratio, advantage, objective, slope):
+    value, gradient = jax.value_and_grad(clipped_objective)(ratio, advantage, 0.2)
+    assert (value, gradient) == (pytest.approx(objective), pytest.approx(slope))
+
+
+def test_gaussian_agrees_with_scipy():
+    generator = np.random.default_rng(0)
+    mean, actions = generator.normal(size=(2, 7, 3)).astype(np.float32)
+    log_standard_deviation = np.array([-1.0, 0.0, 0.7], np.float32)
+    distribution = scipy.stats.norm(mean, np.exp(log_standard_deviation))
+    expected = distribution.logpdf(actions).sum(axis=-1)
+    np.testing.assert_allclose(log_probability(mean, log_standard_deviation, actions), expected, rtol=1e-5)
+    assert entropy(log_standard_deviation) == pytest.approx(distribution.entropy()[0].sum(), rel=1e-5)
 
 
 def test_learns_the_optimal_action():
