@@ -199,7 +199,9 @@ def _jvp_rule(
     primals: Sequence[Array], tangents: Sequence[Any], *, native: Native, world_axes: int
 ) -> tuple[list[Array], list[Any]]:
     outputs = _call_p.bind(*primals, native=native, world_axes=world_axes)
-    mask = tuple(type(tangent) is not ad.Zero and _is_real(primal) for primal, tangent in zip(primals, tangents, strict=True))
+    mask = tuple(
+        type(tangent) is not ad.Zero and _is_real(primal) for primal, tangent in zip(primals, tangents, strict=True)
+    )
     selected = [tangent for tangent, wanted in zip(tangents, mask, strict=True) if wanted]
     zeros = [ad.Zero(jax.typeof(output).to_tangent_aval()) for output in outputs]
     if not selected:

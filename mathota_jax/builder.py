@@ -374,7 +374,9 @@ def _mass_properties(label: str, shape: Shape, mass: float | None, density: floa
 
 
 def _number(label: str, value: Any, lower: float, upper: float) -> float:
-    is_number = np.ndim(value) == 0 and isinstance(value, int | float | np.number | Array) and not isinstance(value, bool)
+    is_number = (
+        np.ndim(value) == 0 and isinstance(value, int | float | np.number | Array) and not isinstance(value, bool)
+    )
     number = float(value) if is_number else math.nan
     if not math.isfinite(number) or not lower <= number <= upper:
         bounds = f"between {lower:g} and {upper:g}" if math.isfinite(upper) else f"of at least {lower:g}"

@@ -205,15 +205,15 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
         for rows in problem.joint_rows
     ]
     if problem.contacts is not None:
-        force = contact.matched_force(
-            model.scene, problem.contacts, vector(state.contact_force), state.contact_feature
-        )
+        force = contact.matched_force(model.scene, problem.contacts, vector(state.contact_force), state.contact_feature)
         force = compute_once(force, state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
     return tuple(start)
 
 
-def _solve(scene: Scene, problem: _Problem, velocity: Array, start: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+def _solve(
+    scene: Scene, problem: _Problem, velocity: Array, start: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...]]:
     """Phase 5: velocity constraints."""
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
@@ -230,9 +230,7 @@ def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: 
     """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
     count = len(problem.joint_rows)
     halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [
-        impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)
-    ]
+    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
     return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
 
 

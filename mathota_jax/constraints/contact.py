@@ -15,9 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints.assembly import Side, collect, inner, pack_scalars, pack_sides, respond, select, select_blocks
 from mathota_jax.bodies import Inertia
+from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.constraints.assembly import (
+    Side,
+    collect,
+    inner,
+    pack_scalars,
+    pack_sides,
+    respond,
+    select,
+    select_blocks,
+)
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded, Cone
@@ -27,7 +36,6 @@ from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
-
 
 RELAXATION = 4 / 3
 """Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
@@ -82,7 +90,9 @@ def couples_rotation(scene: Scene) -> bool:
 def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet, motion: Motion) -> ContactRows:
     """Rows of the contacts in one table."""
     chosen: ContactSet = select(table, contacts)
-    worlds = max(chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1])
+    worlds = max(
+        chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1]
+    )
     normal = chosen.normal
     directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
     rotating = couples_rotation(scene)

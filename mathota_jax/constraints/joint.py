@@ -145,7 +145,9 @@ def velocity_rows(scene: Scene, table: Table, model: Model, joints: JointRows, i
     return _pack(table, jacobians, responses, bias, law, worlds)
 
 
-def position_rows(scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia, percent: float) -> Rows:
+def position_rows(
+    scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia, percent: float
+) -> Rows:
     """Rows of one table for the position correction; `error` (slot, world) is that after the step."""
     jacobians, responses, mass = _sides(scene, table, joints, inertia)
     _, _, one_sided, damped = _chosen(table, joints)
@@ -205,7 +207,12 @@ def _moving_side(scene: Scene, table: Table, joints: JointRows) -> Side:
         return select(table, joints.child)
     parent, child = select(table, joints.parent), select(table, joints.child)
     parts = (
-        Vec3(*(jnp.where(child_moves[:, None], c, p) for c, p in zip(getattr(child, part), getattr(parent, part), strict=True)))
+        Vec3(
+            *(
+                jnp.where(child_moves[:, None], c, p)
+                for c, p in zip(getattr(child, part), getattr(parent, part), strict=True)
+            )
+        )
         for part in ("linear", "angular")
     )
     return Side(*parts)
@@ -257,5 +264,3 @@ def joint_coordinates(model: Model, bodies: Bodies) -> tuple[Array, Array]:
 def joint_impulse_start(table: Table, force: Array, dt: Array, worlds: int) -> Array:
     """Impulses (turn, 1, column, world) from the generalized forces of the last step (slot, world)."""
     return pack_scalars(table, [select(table, force) * dt], worlds)
-
-

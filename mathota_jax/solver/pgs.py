@@ -70,12 +70,14 @@ def solve(
     Returns:
       The velocity with the impulses, and the impulses.
     """
-    velocity = _add_impulses(rows, velocity, impulses)
+    velocity = add_impulses(rows, velocity, impulses)
     if not rows:
         return velocity, impulses
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law for group in rows)
-    return _iterate(iterations, rows, lambda law, impulse, error: law.update(impulse, error), laws, biases, velocity, impulses)
+    return _iterate(
+        iterations, rows, lambda law, impulse, error: law.update(impulse, error), laws, biases, velocity, impulses
+    )
 
 
 def _iterate(
@@ -181,10 +183,6 @@ def row_velocity(group: Rows, velocity: Array) -> Array:
 
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
-    return _add_impulses(rows, velocity, impulses)
-
-
-def _add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     for group, impulse in zip(rows, impulses, strict=True):
         velocity = _add_responses(group.table, group.response, velocity, impulse)
     return velocity
@@ -224,7 +222,7 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
             jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023
         )
     d_impulses = _solve_linear(gradient_iterations, rows, tuple(jacobians), tuple(right_sides))
-    return (velocity, impulses), (_add_impulses(rows, d_velocity, d_impulses), d_impulses)
+    return (velocity, impulses), (add_impulses(rows, d_velocity, d_impulses), d_impulses)
 
 
 def _solve_linear(
@@ -237,7 +235,7 @@ def _solve_linear(
     """
 
     def product(x: tuple[Array, ...]) -> tuple[Array, ...]:
-        velocity = _add_impulses(rows, _no_velocity(rows), x)
+        velocity = add_impulses(rows, _no_velocity(rows), x)
         return tuple(
             part - _apply(by_impulse, part) - _apply(by_error, row_velocity(group, velocity))
             for part, group, (by_impulse, by_error) in zip(x, rows, jacobians, strict=True)

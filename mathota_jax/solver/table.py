@@ -102,11 +102,9 @@ def _colour(constraints: list[Constraint]) -> list[list[Constraint]]:
     """Greedy colouring in the given order."""
     colours: list[tuple[set[int], list[Constraint]]] = []
     for constraint in constraints:
-        for used, members in colours:
-            if used.isdisjoint(constraint.blocks):
-                break
-        else:
-            used, members = set(), []
+        free = (colour for colour in colours if colour[0].isdisjoint(constraint.blocks))
+        used, members = next(free, (set(), []))
+        if not members:
             colours.append((used, members))
         used.update(constraint.blocks)
         members.append(constraint)

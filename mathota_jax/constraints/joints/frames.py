@@ -7,8 +7,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.constraints.assembly import Side
 from mathota_jax.bodies import Bodies, quaternion, vector
+from mathota_jax.constraints.assembly import Side
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
