@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -172,7 +173,7 @@ def _natural_outputs(native: Native, signatures: tuple[Signature, ...]) -> tuple
 def _abstract_evaluation(*avals: Any, native: Native, world_axes: int) -> list[Any]:
     worlds = np.broadcast_shapes(*(a.shape[a.ndim - world_axes :] for a in avals)) if world_axes else ()
     signatures = tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in avals)
-    return [jax.core.ShapedArray((*shape, *worlds), dtype) for shape, dtype in _natural_outputs(native, signatures)]
+    return [ShapedArray((*shape, *worlds), dtype) for shape, dtype in _natural_outputs(native, signatures)]
 
 
 @functools.lru_cache(maxsize=512)

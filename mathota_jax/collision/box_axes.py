@@ -58,7 +58,7 @@ def best_axis(c: list[list[Array]], t: Vec3, t_b: Vec3, half_a: Vec3, half_b: Ve
         best, code = None, None
         for index, separation, projection in candidates:
             this = 2.0 * index + (projection < 0).astype(number)
-            if best is None:
+            if best is None or code is None:
                 best, code = separation, this
             else:
                 better = separation > best

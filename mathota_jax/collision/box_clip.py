@@ -78,7 +78,7 @@ def clip_incident_face(frame: BoxFrame, size: Array) -> tuple[ClipPoint, ...]:
     candidates = [_Candidates(*compute_once((c.u, c.v, c.w, c.code), frame.incident_axis)) for c in candidates]
     merge = MERGE_DISTANCE * size
 
-    first = _winner([LEAN * (c.u + 0.5 * c.v) - c.w for c in candidates], candidates, jnp.finfo(size.dtype).min)
+    first = _winner([LEAN * (c.u + 0.5 * c.v) - c.w for c in candidates], candidates, float(jnp.finfo(size.dtype).min))
     u0, v0 = _coordinates(first, candidates)
     distances = [(c.u - u0) ** 2 + (c.v - v0) ** 2 for c in candidates]
     second = _winner(distances, candidates, merge * merge)
@@ -188,8 +188,9 @@ def _winner(scores: list[Array], candidates: list[_Candidates], threshold: Array
 def _coordinates(code: Array, candidates: list[_Candidates]) -> tuple[Array, Array]:
     """(u, v) of the candidate with this code (finite and meaningless for an empty slot)."""
     wanted = code.astype(candidates[0].code.dtype)
-    u = sum(jnp.where(c.code == wanted, c.u, 0.0) for c in candidates)
-    v = sum(jnp.where(c.code == wanted, c.v, 0.0) for c in candidates)
+    zero = jnp.zeros((), candidates[0].u.dtype)
+    u = sum((jnp.where(c.code == wanted, c.u, 0.0) for c in candidates), zero)
+    v = sum((jnp.where(c.code == wanted, c.v, 0.0) for c in candidates), zero)
     return u[0] + u[1] + u[2] + u[3], v[0] + v[1] + v[2] + v[3]
 
 

@@ -51,7 +51,7 @@ def round_manifold(a: Vec3, b: Vec3, radius_a: Any, radius_b: Any, fallback: Vec
 
 
 def round_point(
-    a: Vec3, b: Vec3, normal: Vec3, radius_a: Any, radius_b: Any, feature: Array | None = None, active: Any = True
+    a: Vec3, b: Vec3, normal: Vec3, radius_a: Any, radius_b: Any, feature: Array | int | None = None, active: Any = True
 ) -> ContactPoint:
     """Contact of two core points inflated by their radii, measured along a given unit `normal`."""
     separation = dot(normal, b - a) - radius_a - radius_b

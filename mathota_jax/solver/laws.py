@@ -1,7 +1,8 @@
 """What an impulse may be: the projections of the projected Gauss-Seidel method, one block of rows at a time.
 
 A law maps the accumulated impulse of a block and the constraint error that it sees to the new accumulated impulse. Its
-fixed points are the solutions of the block, whatever the effective masses, which are given without derivatives. Arrays are (row, column, world) or, for a whole table, (turn, row, ...).
+fixed points are the solutions of the block, whatever the effective masses, which are given without derivatives. Arrays
+are (row, column, world) or, for a whole table, (turn, row, ...).
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +52,7 @@ class Rows:
     table: Table = static()
 
 
-Update = Callable[[object, Array, Array], Array]
+Update = Callable[[Any, Array, Array], Array]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -155,7 +156,7 @@ def _respond(response: Array, impulse: Array, together: int) -> Array:
     return functools.reduce(jnp.add, unstack(total.reshape(total.shape[0], -1, together, total.shape[-1]), 2))
 
 
-def _gather(velocity: Array, blocks: object) -> Array:
+def _gather(velocity: Array, blocks: Any) -> Array:
     """Velocities (component, column, world) of the blocks of a turn; padding reads any block (its Jacobian is 0)."""
     if isinstance(blocks, tuple):
         clipped = [min(block, velocity.shape[1] - 1) for block in blocks]

@@ -150,12 +150,13 @@ def _mode(center: Vec3, reach: Vec3, half: Vec3, gap: Vec3, squared: Array, tiny
     best, code = None, None
     for axis, (c, r, h) in enumerate(zip(center, reach, half, strict=True)):
         separation, this = jnp.abs(c) - h - jnp.abs(r), (2.0 * axis + (c > 0)).astype(number)
-        if best is None:
+        if best is None or code is None:
             best, code = separation, this
         else:
             better = separation > best
             best, code = jnp.where(better, separation, best), jnp.where(better, this, code)
     assert best is not None
+    assert code is not None
     threshold = best + EDGE_MARGIN * size - EDGE_DEPTH_SHARE * best
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3

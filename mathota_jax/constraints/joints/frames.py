@@ -112,10 +112,10 @@ def orientation_rows(frames: JointFrames) -> list[JointRow]:
 def limit_rows(sides: tuple[Side, Side], coordinate: Array, limits: Array) -> list[JointRow]:
     """Stops at a lower and an upper limit; `limits` is (joint, 2, world)."""
     parent, child = sides
-    opposite = tuple(Side(-side.linear, None if side.angular is None else -side.angular) for side in sides)
+    against = [Side(-side.linear, None if side.angular is None else -side.angular) for side in sides]
     return [
         JointRow(parent, child, coordinate - limits[:, 0], one_sided=True),
-        JointRow(*opposite, limits[:, 1] - coordinate, one_sided=True),
+        JointRow(against[0], against[1], limits[:, 1] - coordinate, one_sided=True),
     ]
 
 
