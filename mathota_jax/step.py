@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -118,7 +119,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     scene = model.scene
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
-        return _finish(scene, state, bodies, bodies, None, None)
+        return _finish(scene, state, bodies, moving(scene, bodies), None, None)
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     force, torque = _external(model, state, bodies, action)
@@ -263,20 +264,24 @@ def _correct_positions(
 
 def _merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:
     """All bodies, the moving ones at their new place."""
-    if len(scene.dynamic_bodies) == scene.body_count:
-        return moved
+    return jax.tree.map(lambda old, new: _place(scene, old[:, None], [new])[:, 0], bodies, moved)
+
+
+def _place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:
+    """(body, component, world) array: static bodies from `old`, the others from components of shape (moving, world)."""
+    worlds = max(old.shape[-1], *(component.shape[-1] for component in components))
+    moving_count = len(scene.dynamic_bodies)
+    new = jnp.stack([jnp.broadcast_to(component, (moving_count, worlds)) for component in components], axis=1)
     # Runs of bodies that are all moving or all static; a concatenation of slices is cheaper than a gather.
-    runs = [list(run) for _, run in itertools.groupby(range(scene.body_count), key=lambda body: scene.static[body])]
-    place = {body: place for place, body in enumerate(scene.dynamic_bodies)}
-
-    def merge(new: Array, old: Array) -> Array:
-        worlds = max(new.shape[-1], old.shape[-1])
-        parts = [take(old, run) if scene.static[run[0]] else take(new, [place[body] for body in run]) for run in runs]
-        return jnp.concatenate(
-            [jnp.broadcast_to(part, (len(run), worlds)) for part, run in zip(parts, runs, strict=True)]
-        )
-
-    return jax.tree.map(merge, moved, bodies)
+    parts, start = [], 0
+    for is_static, run in itertools.groupby(range(scene.body_count), key=lambda body: scene.static[body]):
+        bodies = list(run)
+        if is_static:
+            parts.append(jnp.broadcast_to(take(old, bodies), (len(bodies), *new.shape[1:])))
+        else:
+            parts.append(new[start : start + len(bodies)])
+            start += len(bodies)
+    return jnp.concatenate(parts)
 
 
 def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> tuple[Array | None, Array | None]:
@@ -298,10 +303,10 @@ def _finish(
     scene: Scene, state: State, bodies: Bodies, moved: Bodies, joint_force: Array | None, contact_force: Any
 ) -> State:
     """The new state with its flags."""
-    merged = _merge(scene, bodies, compute_once(moved, moved.position.x))
+    moved = compute_once(moved, moved.position.x)
     position, orientation, velocity, angular_velocity = (
-        jnp.stack(list(components), axis=1)
-        for components in (merged.position, merged.orientation, merged.velocity, merged.angular_velocity)
+        _place(scene, getattr(state, name), getattr(moved, name))
+        for name in ("position", "orientation", "velocity", "angular_velocity")
     )
     finite = [jnp.isfinite(value).all((0, 1)) for value in (position, orientation, velocity, angular_velocity)]
     broken = jnp.where(finite[0] & finite[1] & finite[2] & finite[3], 0, int(Flag.NON_FINITE))

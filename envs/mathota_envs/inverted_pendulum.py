@@ -40,11 +40,18 @@ class InvertedPendulum(SimulatedEnvironment):
     What differs:
       * the Y axis points up, and gravity is in the plane x-y;
       * observations are float32;
-      * contact-solver dynamics in maximal coordinates with a semi-implicit step, where MuJoCo has reduced coordinates
-        and a Runge-Kutta step;
+      * constrained bodies with a step of first order, where MuJoCo has joint coordinates and a Runge-Kutta step of
+        fourth order; the motion converges to MuJoCo's as `substeps` grows;
       * the ends of the rail are hard limits, MuJoCo's are soft;
       * no limit of ±90 degrees on the pole, which no episode reaches;
       * a non-finite state is reported in ``info["non_finite"]`` and its observation is made finite.
+
+    Speed against error, measured at 64 worlds in float32 on one core of a shared x86 machine; the error is that of the
+    rate (4.54/s) at which the pole falls, the fastest of the linearised motion:
+
+        substeps                      1       2       4       8
+        error of the rate           -4.6 %  -2.3 %  -1.2 %  -0.6 %
+        1000 steps / CPU-second      156     104      62      36
 
     Attributes:
         reset_noise_scale: largest magnitude of every coordinate [m, rad] and rate [m/s, rad/s] at the start.

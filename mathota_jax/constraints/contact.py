@@ -99,7 +99,9 @@ def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet,
     jacobians, responses, start, free = [], [], jnp.zeros(()), jnp.zeros(())
     for side, sign in enumerate(_signs(scene, table)):
         inertia = select_blocks(table, side, motion.inertia)
-        arm = compute_once(chosen.position - select_blocks(table, side, motion.position), chosen.separation)
+        # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
+        surface = chosen.position + normal * (jnp.maximum(chosen.separation, 0.0) * (0.5 * sign))
+        arm = compute_once(surface - select_blocks(table, side, motion.position), chosen.separation)
         jacobian = [
             Side(direction * sign, compute_once(cross(arm, direction) * sign, arm.x) if rotating else None)
             for direction in directions

@@ -64,10 +64,14 @@ def materialize(values: Any) -> Any:
     """Stores every array of a pytree, and in reverse mode its cotangent, before anything else reads it.
 
     `compute_once` can not help where a single consumer is the problem: a concatenation of long expressions is compiled
-    to one kernel that branches for every element. A conditional is never fused. Its predicate is true: no square is
-    2 or 3 modulo 4.
+    to one kernel that branches for every element. A conditional is never fused. Its predicate is true, since no square is
+    2 or 3 modulo 4; its other branch differs only so that XLA can not merge the two.
+
+    Args:
+        values: Pytree of finite arrays whose first two leaves have the same shape.
     """
-    first = jax.tree.leaves(values)[0]
-    bits = lax.bitcast_convert_type(first.reshape(-1)[0].astype(jnp.float32), jnp.int32)
-    always = (bits * bits) & 3 < 2
-    return lax.cond(always, lambda tree: tree, lambda tree: jax.tree.map(jnp.negative, tree), values)
+    leaves, tree = jax.tree.flatten(values)
+    bits = lax.bitcast_convert_type(leaves[0].reshape(-1)[0].astype(jnp.float32), jnp.int32)
+    always = ((bits * bits) & 3) < 2
+    stored = lax.cond(always, lambda *x: x, lambda first, second, *rest: (second, first, *rest), *leaves)
+    return jax.tree.unflatten(tree, stored)
