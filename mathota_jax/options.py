@@ -24,7 +24,7 @@ class Options:
       position_percent: share of the position error corrected in a step. Guide 10.3.
       baumgarte: share of a joint's position error turned into velocity in a step. Guide 9.5.
       warm_start: start the solver from the impulses of the previous step. Guide 7.3 and 12.4.
-      gradient_iterations: sweeps of the linear solver behind a derivative; None for as many as the solver's own.
+      gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
     """
 
     dt: float = 1 / 60

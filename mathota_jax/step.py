@@ -176,8 +176,9 @@ def _constrain(
     joints, joint_rows = None, ()
     if scene.joints:
         joints = joint.joint_rows(model, bodies)
+        middle = joint.joint_rows(model, joint.midpoint(bodies, model.dt))
         joint_rows = tuple(
-            joint.velocity_rows(scene, table, model, joints, inertia) for table in joint.joint_tables(scene)
+            joint.velocity_rows(scene, table, model, joints, middle, inertia) for table in joint.joint_tables(scene)
         )
     contacts, contact_rows = None, []
     if scene.pair_groups:
@@ -224,7 +225,7 @@ def _solve(
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
-    return scene.options.gradient_iterations or iterations
+    return scene.options.gradient_iterations or 2 * iterations
 
 
 def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:

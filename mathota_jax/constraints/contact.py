@@ -176,9 +176,22 @@ def _row_bound(
                     jnp.zeros(()),
                 )
                 squared = squared + block * block
-        norm_of_block = safe_sqrt(squared)
+        norm_of_block = _largest_eigenvalue(jacobians, responses, rows) if shift == 0 else safe_sqrt(squared)
         total = total + (norm_of_block if shift == 0 else norm_of_block * others(active, shift))
     return total if count == 1 else total / RELAXATION
+
+
+def _largest_eigenvalue(jacobians: list[list[Side]], responses: list[list[Side]], rows: tuple[int, ...]) -> Array:
+    """Of the response ``J M^-1 J^T`` of one point along one or two rows."""
+
+    def entry(row: int, column: int) -> Array:
+        return sum((inner(j[row], r[column]) for j, r in zip(jacobians, responses, strict=True)), jnp.zeros(()))
+
+    if len(rows) == 1:
+        return entry(rows[0], rows[0])
+    first, second, coupling = entry(rows[0], rows[0]), entry(rows[1], rows[1]), entry(rows[0], rows[1])
+    half_difference = (first - second) / 2
+    return (first + second) / 2 + safe_sqrt(half_difference * half_difference + coupling * coupling)
 
 
 def _push_only(effective_mass: Array) -> Bounded:

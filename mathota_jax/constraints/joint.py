@@ -19,6 +19,7 @@ from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import Constraint, Table, make_tables
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.quaternion import exponential, multiply
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 
@@ -68,11 +69,12 @@ def joint_tables(scene: Scene) -> tuple[Table, ...]:
 
 
 class JointRows(NamedTuple):
-    """All joint rows in slot order, components of shape (slot, world)."""
+    """All joint rows in slot order, components of shape (slot, world); `rate` is the Jacobian times the velocities."""
 
     parent: Side
     child: Side
     error: Array
+    rate: Array
     damping: Array
     one_sided: np.ndarray
     damped: np.ndarray
@@ -81,6 +83,7 @@ class JointRows(NamedTuple):
 def joint_rows(model: Model, bodies: Bodies) -> JointRows:
     """Jacobians and errors of all joint rows at the poses of all bodies."""
     rows: list[JointRow] = []
+    rates: list[Array] = []
     counts: list[int] = []
     for group in joint_groups(model.scene):
         kind = JOINTS[group.kind]
@@ -91,6 +94,9 @@ def joint_rows(model: Model, bodies: Bodies) -> JointRows:
             group_rows += limit_rows(kind.free_sides(frames), kind.coordinate(frames), limits)
         if group.damped:
             group_rows.append(damping_row(kind.free_sides(frames), take(model.joint_damping, group.joints)))
+        members = [[getattr(model.scene.joints[joint], name) for joint in group.joints] for name in ("parent", "child")]
+        parent_motion, child_motion = (Side(*take((bodies.velocity, bodies.angular_velocity), m)) for m in members)
+        rates += [inner(row.parent, parent_motion) + inner(row.child, child_motion) for row in group_rows]
         rows += group_rows
         counts += [len(group.joints)] * len(group_rows)
 
@@ -99,14 +105,15 @@ def joint_rows(model: Model, bodies: Bodies) -> JointRows:
         return Side(*(_stack_vectors([getattr(s, part) for s in sides], counts) for part in ("linear", "angular")))
 
     zero = jnp.zeros((1, 1), model.dt.dtype)
-    parent, child, error = compute_once(
-        (side("parent"), side("child"), _stack([row.error for row in rows], counts)),
+    parent, child, error, rate = compute_once(
+        (side("parent"), side("child"), _stack([row.error for row in rows], counts), _stack(rates, counts)),
         bodies.position.x,
     )
     return JointRows(
         parent=parent,
         child=child,
         error=error,
+        rate=rate,
         damping=_stack([zero if row.damping is None else row.damping for row in rows], counts),
         one_sided=np.repeat([row.one_sided for row in rows], counts),
         damped=np.repeat([row.damping is not None for row in rows], counts),
@@ -122,13 +129,35 @@ def _stack_vectors(values: list[Vec3], counts: list[int]) -> Vec3:
     return Vec3(*(_stack([value[axis] for value in values], counts) for axis in range(3)))
 
 
-def velocity_rows(scene: Scene, table: Table, model: Model, joints: JointRows, inertia: Inertia) -> Rows:
-    """Rows of one table for the velocity solver."""
-    jacobians, responses, mass = _sides(scene, table, joints, inertia)
+def midpoint(bodies: Bodies, dt: Array) -> Bodies:
+    """Where the bodies are after half a step at their present velocities."""
+    turn = exponential(bodies.angular_velocity * (0.5 * dt))
+    return bodies._replace(
+        position=bodies.position + bodies.velocity * (0.5 * dt), orientation=multiply(turn, bodies.orientation)
+    )
+
+
+def velocity_rows(
+    scene: Scene, table: Table, model: Model, joints: JointRows, middle: JointRows, inertia: Inertia
+) -> Rows:
+    """Rows of one table for the velocity solver.
+
+    Args:
+      scene, table, model: structure and parameters.
+      joints: rows at the start of the step, whose errors are corrected.
+      middle: rows at the middle of the step, whose Jacobians are used. A joint holds on average over the step:
+        ``J_middle (u_start + u_end) = 0``, where what already violates the joint at the start, ``J_start u_start``, is left
+        out and so damped away. With the Jacobian of the start, a turning body would lose (omega dt)^2 of its energy in
+        each step.
+      inertia: of the moving bodies.
+    """
+    jacobians, responses, mass = _sides(scene, table, middle, inertia)
     error, damping, one_sided, damped = _chosen(table, joints)
+    curvature = select(table, middle.rate - joints.rate)
     worlds = max(mass.shape[-1], error.shape[-1])
     pull = scene.options.baumgarte * error / model.dt
     bias = jnp.where(damped, 0.0, jnp.where(one_sided & (error > 0), error / model.dt, pull))
+    bias = bias + jnp.where(damped | one_sided, 0.0, curvature)
     # This softness makes a lone coordinate decay by exactly exp(-damping * J M^-1 J^T * dt) in a step.
     decay = jnp.clip(damping * mass * model.dt, 0.0, LARGEST_DECAY)
     # Where nothing is damped the row is void: an infinite softness, expressed by a zero effective mass.

@@ -59,7 +59,7 @@ def block_on_rail(*, axis=(1, 0, 0), gravity=DOWN, motor=None, **joint):
     block = builder.add_body(Box((0.1, 0.05, 0.08)), mass=MASS)
     slider = builder.add_joint(Slider(parent=post, child=block, anchor=(0, 0, 0), axis=axis, **joint))
     if motor is not None:
-        builder.add_motor(slider, kind="force", **motor)
+        builder.add_motor(slider, kind="torque", **motor)
     return builder.build(undamped(dt=DT))
 
 
@@ -204,7 +204,7 @@ def two_free_bodies(joint, motor):
     return builder.build(undamped(dt=DT))
 
 
-@pytest.mark.parametrize(("joint", "motor"), [(Hinge, "torque"), (Slider, "force")])
+@pytest.mark.parametrize(("joint", "motor"), [(Hinge, "torque"), (Slider, "torque")])
 def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     model, state = two_free_bodies(joint, motor)
     final = advance(model, state, 120, np.array([0.5]))
