@@ -28,7 +28,7 @@ def everything(restitution):
     builder.add_motor(hinge, kind="torque", limit=1.0)
     cart = builder.add_body(Sphere(0.1), mass=0.5, position=(7.0, 1.0, 0.0), **surface)
     slider = builder.add_joint(Slider(parent=ground, child=cart, anchor=(7, 1, 0), axis=(1, 0, 0), limits=(0.0, 0.5)))
-    builder.add_motor(slider, kind="force", limit=1.0)
+    builder.add_motor(slider, kind="torque", limit=1.0)
     return builder.build(undamped(dt=1 / 60))
 
 

@@ -17,6 +17,7 @@ from tests.scenes import (
     repeat,
     slab_on_plane,
     tilted_gravity,
+    undamped,
     with_dt,
 )
 
@@ -58,7 +59,9 @@ def test_slab_sticks_or_slides(precision, gate):
 
 def test_tall_box_tips_at_the_angle_of_its_footprint(precision, gate):
     angle = np.arange(13.0, 15.01, 0.05)
-    tall = functools.partial(body_on_plane, Box((0.1, 0.4, 0.1)), position=(0.0, 0.4, 0.0))
+    # Near the balance the whole load moves to one edge, which ten sweeps do not follow: they tip it 0.54 degrees early.
+    options = undamped(velocity_iterations=40)
+    tall = functools.partial(body_on_plane, Box((0.1, 0.4, 0.1)), position=(0.0, 0.4, 0.0), options=options)
     models, states = on_slopes(tall, np.full_like(angle, 1.5), angle, 1 / 60)
     final = advance_worlds(models, states, 180)
     tilt = angle_between(final.orientation[:, 1], states.orientation[:, 1])

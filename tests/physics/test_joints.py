@@ -74,7 +74,8 @@ def test_pendulum_period_energy_and_gap(precision, gate):
     worlds = [pendulum(angle) for angle in amplitudes]
     models, states = stack([m for m, _ in worlds]), stack([s for _, s in worlds])
     _, record = record_worlds(models, states, 1200, with_joint_angle)
-    angle = np.asarray(record["angle"], dtype=float)[:, :, 0] + amplitudes
+    # The coordinate of a hinge lies in (-pi, pi]; the swing of 4 rad does not.
+    angle = np.unwrap(np.asarray(record["angle"], dtype=float)[:, :, 0], axis=0) + amplitudes
     time = DT * (1 + np.arange(len(angle)))
     for world, amplitude in enumerate(amplitudes):
         turn = angle[:, world]

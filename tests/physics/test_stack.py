@@ -22,6 +22,17 @@ def test_ten_boxes_stand(precision, gate):
     assert int(final.flags[0]) == 0
 
 
+def test_ten_boxes_stay_in_place(precision, gate):
+    model, state = box_stack(COUNT)
+    final, record = record_worlds(repeat(model, 1), repeat(state, 1), 1200, motion_and_penetration)
+    moved = np.asarray(record["position"], dtype=float)[:, 0, 1:] - np.asarray(state.position, dtype=float)[1:]
+    gate("penetration in 5 s [m]", record["penetration"], 1e-3)
+    gate("horizontal drift in 5 s [m]", np.linalg.norm(moved[..., [0, 2]], axis=-1), 1e-3)
+    gate("height lost between the second and the last second [m]", moved[-1, :, 1] - moved[240, :, 1], 1e-4)
+    gate("speed at the end [m/s]", final.velocity[0, 1:], 1e-3)
+    assert int(final.flags[0]) == 0
+
+
 def test_each_level_carries_the_weight_above_it(precision, gate):
     model, state = box_stack(COUNT)
     final = advance(model, state, 480)

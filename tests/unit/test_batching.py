@@ -23,7 +23,7 @@ def scene():
     arm = builder.add_body(Sphere(0.1), mass=0.5, position=(3.0, 1.0, 0.0))
     hinge = builder.add_joint(Hinge(parent=ground, child=arm, anchor=(3.2, 1.0, 0.0), axis=(0, 0, 1), damping=0.1))
     builder.add_motor(hinge, kind="torque", limit=5.0)
-    return builder.build(undamped(dt=1 / 60))
+    return builder.build(undamped(dt=1 / 60, velocity_iterations=100, gradient_iterations=200))
 
 
 def apply(parameters):

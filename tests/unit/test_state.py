@@ -196,7 +196,7 @@ def turned_scene(turn):
         )
     arm = builder.add_body(Box((0.2, 0.03, 0.03)), mass=0.5, position=place((-2.0, 2.0, 0.0)), orientation=turn)
     builder.add_joint(Hinge(parent=ground, child=arm, anchor=place((-2.2, 2.0, 0.0)), axis=place((0, 0, 1))))
-    return builder.build(undamped(dt=1 / 240))
+    return builder.build(undamped(dt=1 / 240, velocity_iterations=100))
 
 
 @pytest.mark.parametrize("name", TURNS)

@@ -1,0 +1,41 @@
+"""Gates that are not met yet: tests that run and must fail, each with what was measured and why.
+
+A test that starts to pass fails the suite (strict xfail), so that its entry is removed the same day.
+"""
+
+from __future__ import annotations
+
+EVENTS = "contact geometry is taken at the start of the step, not at the time of impact, and one impact is resolved per step; "
+SWEEPS = "not converged with the default 10 sweeps; "
+
+SHORTFALLS: dict[str, str] = {
+    "tests/physics/test_billiards.py::test_oblique_collision": EVENTS + "positions 6.6e-3 m off at dt 1/240, gate 1e-3",
+    "tests/physics/test_billiards.py::test_cradle_passes_the_whole_velocity_on": EVENTS
+    + "the last ball leaves with 0.71 of the velocity, gate 0.999",
+    "tests/physics/test_momentum.py::test_collisions_keep_the_invariants": EVENTS
+    + "angular momentum 0.013 to 0.025 kg m^2/s off, gate 1e-9",
+    "tests/physics/test_joints.py::test_hinge_limits_hold[float32-1.0]": SWEEPS
+    + "joint gap 5.6e-3 of the arm, gate 5e-3",
+    "tests/physics/test_joints.py::test_hinge_limits_hold[float64-1.0]": SWEEPS
+    + "joint gap 5.6e-3 of the arm, gate 5e-3",
+    "tests/physics/test_joints.py::test_double_pendulum_keeps_its_joints_closed[float32]": SWEEPS
+    + "a link ten times as heavy as the one that holds it makes the world diverge after 640 steps",
+    "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack settles 4.9 mm into the slop of its ten contacts "
+    "(penetration and sideways drift meet their gates, see test_ten_boxes_stay_in_place), gate 1 mm",
+    "tests/physics/test_stack.py::test_warm_start_is_what_carries_a_tall_stack[True]": "sinks 4.2 mm into the slop, gate 1 mm",
+    "tests/physics/test_warm_start.py::test_removing_the_heavy_ball_does_not_lift_the_light_ones[float64]": SWEEPS
+    + "stale impulses lift the light balls by 43 mm, gate 1 mm",
+    "tests/physics/test_warm_start.py::test_swapping_owners_of_the_cached_contacts_does_not_kick": SWEEPS
+    + "2.6 to 6.1 m/s after the swap, gate 0.01",
+    "tests/physics/test_warm_start.py::test_a_slot_that_changes_its_feature_does_not_reuse_the_impulse[float64]": SWEEPS
+    + "0.14 m/s after the shift, gate 0.01",
+    "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter": SWEEPS
+    + "positions differ by 0.03 to 0.7 m after a pile has settled, gate 1e-4",
+}
+
+# Limits in CPU seconds, which depend on the machine: a pass is welcome and does not fail the suite.
+TIMINGS: dict[str, str] = {
+    "tests/compile/test_compile_time.py::test_compile_time_of_a_step[1-2.0]": "3 to 4 CPU-s measured, most of it in XLA's "
+    "code generation of 150 kernels, target 2",
+    "tests/compile/test_compile_time.py::test_compile_time_of_a_step[10-6.0]": "11 to 13 CPU-s measured, target 6",
+}
