@@ -5,7 +5,7 @@ A test that starts to pass fails the suite (strict xfail), so that its entry is 
 
 from __future__ import annotations
 
-EVENTS = "contact geometry is taken at the start of the step, not at the time of impact, and one impact is resolved per step; "
+EVENTS = "contacts are taken at the start of the step, not at the time of impact, and one impact is resolved per step; "
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
@@ -22,7 +22,8 @@ SHORTFALLS: dict[str, str] = {
     + "a link ten times as heavy as the one that holds it makes the world diverge after 640 steps",
     "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack settles 4.9 mm into the slop of its ten contacts "
     "(penetration and sideways drift meet their gates, see test_ten_boxes_stay_in_place), gate 1 mm",
-    "tests/physics/test_stack.py::test_warm_start_is_what_carries_a_tall_stack[True]": "sinks 4.2 mm into the slop, gate 1 mm",
+    "tests/physics/test_stack.py::test_warm_start_is_what_carries_a_tall_stack[True]": "sinks 4.2 mm into the slop, "
+    "gate 1 mm",
     "tests/physics/test_warm_start.py::test_removing_the_heavy_ball_does_not_lift_the_light_ones[float64]": SWEEPS
     + "stale impulses lift the light balls by 43 mm, gate 1 mm",
     "tests/physics/test_warm_start.py::test_swapping_owners_of_the_cached_contacts_does_not_kick": SWEEPS
