@@ -40,7 +40,7 @@ class InvertedPendulum(SimulatedEnvironment):
     What differs:
       * the Y axis points up, and gravity is in the plane x-y;
       * observations are float32;
-      * constrained bodies with a step of first order, where MuJoCo has joint coordinates and a Runge-Kutta step of
+      * constrained bodies with a step of second order, where MuJoCo has joint coordinates and a Runge-Kutta step of
         fourth order; the motion converges to MuJoCo's as `substeps` grows;
       * the ends of the rail are hard limits, MuJoCo's are soft;
       * no limit of ±90 degrees on the pole, which no episode reaches;
@@ -58,7 +58,6 @@ class InvertedPendulum(SimulatedEnvironment):
     """
 
     frame_skip: int = 2
-    substeps: int = 4
     reset_noise_scale: float = 0.01
 
     time_step: ClassVar[float] = 0.02

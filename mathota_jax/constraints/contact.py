@@ -155,30 +155,35 @@ def _row_bound(
     mass.
     """
     count = table.together
-
-    def others(tree: Any, shift: int) -> Any:
-        def roll(value: Array) -> Array:
-            if jnp.ndim(value) < 2 or value.shape[0] == 1:
-                return value
-            return jnp.roll(value.reshape(-1, count, value.shape[-1]), shift, axis=1).reshape(value.shape)
-
-        return jax.tree.map(roll, tree)
-
     # The length of a step does not move the fixed point: its derivative is not worth computing.
     jacobians, responses = jax.lax.stop_gradient((jacobians, responses))
-    total = jnp.zeros(())
-    for shift in range(count):
+    total = _largest_eigenvalue(jacobians, responses, rows)
+    if count == 1:
+        return total
+    same = np.tile(np.eye(count), (len(table.order) // count, 1))[:, :, None]
+    for point in range(count):
+        neighbour = _neighbour(responses, point, count)
         squared = jnp.zeros(())
         for row in rows:
             for column in rows:
-                block = sum(
-                    (inner(j[row], others(r[column], shift)) for j, r in zip(jacobians, responses, strict=True)),
-                    jnp.zeros(()),
-                )
+                pairs = zip(jacobians, neighbour, strict=True)
+                block = sum((inner(j[row], r[column]) for j, r in pairs), jnp.zeros(()))
                 squared = squared + block * block
-        norm_of_block = _largest_eigenvalue(jacobians, responses, rows) if shift == 0 else safe_sqrt(squared)
-        total = total + (norm_of_block if shift == 0 else norm_of_block * others(active, shift))
-    return total if count == 1 else total / RELAXATION
+        weight = (1.0 - same[:, point]) * _neighbour(active, point, count)
+        total = total + safe_sqrt(squared) * weight
+    return total / RELAXATION
+
+
+def _neighbour(tree: Any, point: int, count: int) -> Any:
+    """For every column, the values of the given point of its manifold."""
+
+    def pick(value: Array) -> Array:
+        if jnp.ndim(value) < 2 or value.shape[0] == 1:
+            return value
+        one = value.reshape(-1, count, value.shape[-1])[:, point : point + 1]
+        return jnp.broadcast_to(one, (one.shape[0], count, one.shape[2])).reshape(value.shape)
+
+    return jax.tree.map(pick, tree)
 
 
 def _largest_eigenvalue(jacobians: list[list[Side]], responses: list[list[Side]], rows: tuple[int, ...]) -> Array:

@@ -49,8 +49,21 @@ def placements():
     }
 
 
-@pytest.mark.parametrize("restitution", [0.0, 0.5])
-def test_every_gradient_is_finite(precision, restitution):
+@pytest.mark.parametrize(
+    ("restitution", "double"),
+    [
+        (0.5, False),
+        (0.0, True),
+        pytest.param(0.0, False, marks=pytest.mark.slow),
+        pytest.param(0.5, True, marks=pytest.mark.slow),
+    ],
+)
+def test_every_gradient_is_finite(restitution, double):
+    with jax.enable_x64(double):
+        check_every_gradient(restitution)
+
+
+def check_every_gradient(restitution):
     model, state = everything(restitution)
     names = list(placements())
     states = stack(
