@@ -57,10 +57,10 @@ class _Face(NamedTuple):
     half_v: Array
 
 
-def clip_incident_face(frame: BoxFrame, size: Array) -> tuple[ClipPoint, ...]:
-    """Four points; the deepest first, then those that span the largest area. Code -1 marks an empty slot.
+def clip_incident_face(frame: BoxFrame, size: Array) -> ClipPoint:
+    """Four points on a new leading axis; the deepest first, then those that span the largest area.
 
-    In edge mode all slots are empty, with finite coordinates.
+    Code -1 marks an empty slot. In edge mode all slots are empty, with finite coordinates.
     """
     sign = (2 * frame.incident_outward - 1).astype(frame.half.x.dtype)
     normal, along_1, along_2 = frame.incident
@@ -96,7 +96,7 @@ def clip_incident_face(frame: BoxFrame, size: Array) -> tuple[ClipPoint, ...]:
         for area, c in zip(areas, candidates, strict=True)
     ]
     fourth = _winner(added, candidates, jnp.where(third < 0, jnp.inf, least_area))
-    return tuple(_point(face, code) for code in (first, second, third, fourth))
+    return _point(face, jnp.stack([first, second, third, fourth]))
 
 
 class _Candidates(NamedTuple):
@@ -222,7 +222,7 @@ def code_parts(code: Array) -> CodeParts:
 
 
 def _point(face: _Face, code: Array) -> ClipPoint:
-    """The point with a given code, differentiable."""
+    """The points with the given codes (point, pair, world), differentiable."""
     parts = code_parts(code)
     number = face.center.x.dtype
     first = jnp.where(parts.first_positive, 1.0, -1.0).astype(number)
@@ -243,6 +243,7 @@ def _point(face: _Face, code: Array) -> ClipPoint:
     alpha, beta = _solve(face, first * face.half_u - face.center.x, second * face.half_v - face.center.y, corner)
     alpha = jnp.where(corner, alpha, jnp.where(along_alpha, walked, first))
     beta = jnp.where(corner, beta, jnp.where(along_alpha, first, walked))
+    alpha, beta = compute_once((alpha, beta), alpha)
     point = face.center + face.alpha * alpha + face.beta * beta
     return ClipPoint(point.x, point.y, point.z, code)
 

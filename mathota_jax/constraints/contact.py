@@ -8,6 +8,7 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import Constraint, Table, make_tables
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
@@ -160,30 +161,28 @@ def _row_bound(
     total = _largest_eigenvalue(jacobians, responses, rows)
     if count == 1:
         return total
-    same = np.tile(np.eye(count), (len(table.order) // count, 1))[:, :, None]
-    for point in range(count):
-        neighbour = _neighbour(responses, point, count)
-        squared = jnp.zeros(())
-        for row in rows:
-            for column in rows:
-                pairs = zip(jacobians, neighbour, strict=True)
-                block = sum((inner(j[row], r[column]) for j, r in pairs), jnp.zeros(()))
-                squared = squared + block * block
-        weight = (1.0 - same[:, point]) * _neighbour(active, point, count)
-        total = total + safe_sqrt(squared) * weight
-    return total / RELAXATION
+    own, neighbour = _by_point(jacobians, count, 2), _by_point(responses, count, 0)
+    squared = jnp.zeros(())
+    for row in rows:
+        for column in rows:
+            block = sum((inner(j[row], r[column]) for j, r in zip(own, neighbour, strict=True)), jnp.zeros(()))
+            squared = squared + block * block
+    others = 1.0 - np.eye(count)[:, None, :, None]
+    norms = safe_sqrt(squared) * (others * _by_point(active, count, 0))
+    norms = norms.reshape(count, len(table.order), norms.shape[-1])
+    return functools.reduce(jnp.add, unstack(norms, 0), total) / RELAXATION
 
 
-def _neighbour(tree: Any, point: int, count: int) -> Any:
-    """For every column, the values of the given point of its manifold."""
+def _by_point(tree: Any, count: int, axis: int) -> Any:
+    """Values (column, world) as (point, manifold, point, world) that vary along one of the two point axes."""
 
-    def pick(value: Array) -> Array:
+    def spread(value: Array) -> Array:
         if jnp.ndim(value) < 2 or value.shape[0] == 1:
             return value
-        one = value.reshape(-1, count, value.shape[-1])[:, point : point + 1]
-        return jnp.broadcast_to(one, (one.shape[0], count, one.shape[2])).reshape(value.shape)
+        split = value.reshape(-1, count, value.shape[-1])
+        return split[None] if axis == 2 else jnp.swapaxes(split, 0, 1)[:, :, None]
 
-    return jax.tree.map(pick, tree)
+    return jax.tree.map(spread, tree)
 
 
 def _largest_eigenvalue(jacobians: list[list[Side]], responses: list[list[Side]], rows: tuple[int, ...]) -> Array:

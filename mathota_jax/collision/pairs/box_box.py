@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from mathota_jax.collision.box_axes import best_axis, contact_size, preference_margin, relative_rotation
@@ -12,8 +13,9 @@ from mathota_jax.collision.box_clip import CROSSING_U, VERTEX, ClipPoint, clip_i
 from mathota_jax.collision.box_frame import BoxFrame, box_frame
 from mathota_jax.collision.closest import clamp, clamp_to_box
 from mathota_jax.collision.manifold import ContactPoint, Manifold
+from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.settle import settle, settle_code
+from mathota_jax.spatial.settle import compute_once, settle, settle_code
 from mathota_jax.spatial.vector import Vec3, dot, where
 
 EDGE_PAIR = 16
@@ -50,7 +52,7 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     # Separated, and the axis of the test is not the direction of the closest points: then those.
     round_off = 64.0 * jnp.finfo(t.x.dtype).eps * (size + jnp.abs(apart.depth))
     gap_grows = apart.separation > apart.depth + preference_margin(apart.depth, size) + round_off
-    face_misses = (clipped[0].code < 0) | ((apart.depth > 0) & gap_grows)
+    face_misses = (clipped.code[0] < 0) | ((apart.depth > 0) & gap_grows)
     edge_misses = crossing.clamped & (crossing.separation > 0)
     # What slot 0 holds: 0 a clipped point, 1 an edge crossing, 2 closest points of separated boxes,
     # 3 the deepest incident corner (overlapping, but no part of the incident face lies over the reference face).
@@ -68,18 +70,24 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     facing = jnp.where(frame.reference_b, -1.0, 1.0).astype(t.x.dtype)
     normal_w = frame.basis.apply(normal) * facing
 
-    points = []
-    for index, point in enumerate(clipped):
-        separation, feature = point.w, _clip_feature(frame, point)
-        middle = Vec3(point.u, point.v, frame.half.z + 0.5 * point.w)
-        active = (point.code >= 0) & on_face
-        if index == 0:
-            middle = where(on_face, middle, where(on_edge, crossing.middle, apart.middle))
-            closest = jnp.where(on_closest, apart.separation, apart.depth)
-            separation = jnp.where(on_face, separation, jnp.where(on_edge, crossing.separation, closest))
-            feature = jnp.where(on_face, feature, jnp.where(on_edge, crossing.feature, CLOSEST_POINTS))
-            active = jnp.ones_like(active)
-        points.append(ContactPoint(frame.origin + frame.basis.apply(middle), separation, feature, active))
+    # All four slots at once: as four expressions they would be compiled four times.
+    in_first = jnp.asarray(np.arange(4) == 0).reshape(4, 1, 1)
+    from_clip = on_face | ~in_first
+    middle = Vec3(clipped.u, clipped.v, frame.half.z + 0.5 * clipped.w)
+    closest = jnp.where(on_closest, apart.separation, apart.depth)
+    other_middle = where(on_edge, crossing.middle, apart.middle)
+    other_separation = jnp.where(on_edge, crossing.separation, closest)
+    other_middle, other_separation = compute_once((other_middle, other_separation), other_separation)
+    middle = where(from_clip, middle, other_middle)
+    separation = jnp.where(from_clip, clipped.w, other_separation)
+    otherwise = jnp.where(on_edge, crossing.feature, CLOSEST_POINTS)
+    feature = jnp.where(from_clip, _clip_feature(frame, clipped), otherwise)
+    active = in_first | ((clipped.code >= 0) & on_face)
+    normal_w = compute_once(normal_w, separation)
+    slots = compute_once((*(frame.origin + frame.basis.apply(middle)), separation), separation)
+    x, y, z, separation = (unstack(values, 0) for values in slots)
+    fields = zip(x, y, z, separation, strict=True)
+    points = [ContactPoint(Vec3(*p), gap, feature[k], active[k]) for k, (*p, gap) in enumerate(fields)]
     return Manifold(normal_w, tuple(points))
 
 
