@@ -1,6 +1,7 @@
 """mathota_jax: a differentiable rigid-body contact engine in JAX. This module is the whole public API."""
 
 from mathota_jax.builder import SceneBuilder
+from mathota_jax.collision.raycast import Raycast, raycast
 from mathota_jax.constraints.joints.hinge import Hinge
 from mathota_jax.constraints.joints.slider import Slider
 from mathota_jax.diagnostics import (
@@ -36,6 +37,7 @@ __all__ = [
     "Options",
     "Plane",
     "Polyhedron",
+    "Raycast",
     "Scene",
     "SceneBuilder",
     "Slider",
@@ -49,6 +51,7 @@ __all__ = [
     "joint_position",
     "joint_velocity",
     "momentum",
+    "raycast",
     "rollout",
     "step",
 ]
