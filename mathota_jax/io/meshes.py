@@ -206,7 +206,7 @@ def _read_parts(path: Path) -> list[np.ndarray] | None:
     """Parts from the cache; None if there are none or the file is damaged."""
     try:
         with np.load(path) as file:
-            return [file[f"part_{index}"] for index in range(len(file.files))] or None
+            return [file[f"arr_{index}"] for index in range(len(file.files))] or None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
 
@@ -219,5 +219,5 @@ def _write_parts(path: Path, parts: list[np.ndarray]) -> None:
     except OSError as error:
         raise OSError(f"can not keep convex parts in '{path.parent}': {error}; pass cache=False or a folder") from error
     with os.fdopen(handle, "wb") as file:
-        np.savez_compressed(file, **{f"part_{index}": points for index, points in enumerate(parts)})
+        np.savez_compressed(file, *parts)
     os.replace(name, path)
