@@ -1,6 +1,7 @@
 """mathota_jax: a differentiable rigid-body contact engine in JAX. This module is the whole public API."""
 
 from mathota_jax.builder import SceneBuilder
+from mathota_jax.collision.raycast import Raycast, raycast
 from mathota_jax.constraints.joints.hinge import Hinge
 from mathota_jax.constraints.joints.slider import Slider
 from mathota_jax.diagnostics import (
@@ -13,7 +14,7 @@ from mathota_jax.diagnostics import (
     joint_velocity,
     momentum,
 )
-from mathota_jax.geometry import Box, Capsule, Plane, Sphere
+from mathota_jax.geometry import Box, Capsule, Compound, Cone, Cylinder, Heightfield, Plane, Polyhedron, Sphere
 from mathota_jax.model import Model
 from mathota_jax.options import Options
 from mathota_jax.scene import Scene
@@ -25,12 +26,18 @@ __version__ = "0.1.0"
 __all__ = [
     "Box",
     "Capsule",
+    "Compound",
+    "Cone",
     "Contacts",
+    "Cylinder",
     "Flag",
+    "Heightfield",
     "Hinge",
     "Model",
     "Options",
     "Plane",
+    "Polyhedron",
+    "Raycast",
     "Scene",
     "SceneBuilder",
     "Slider",
@@ -44,6 +51,7 @@ __all__ = [
     "joint_position",
     "joint_velocity",
     "momentum",
+    "raycast",
     "rollout",
     "step",
 ]
