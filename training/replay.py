@@ -118,7 +118,13 @@ def replay_data(model: Any, trajectory: Any, dt: float, contacts: Any = None, ti
 
 
 def _json_shape(shape: dict[str, Any]) -> dict[str, Any]:
-    names = {"bounding_radius": "boundingRadius", "half_extents": "halfExtents", "half_height": "halfHeight"}
+    names = {
+        "bounding_radius": "boundingRadius",
+        "half_extents": "halfExtents",
+        "half_height": "halfHeight",
+        "local_position": "localPosition",
+        "local_orientation": "localOrientation",
+    }
     named = {names.get(name, name): value for name, value in shape.items()}
     # JSON has no infinity; the viewer needs the radius of bounded shapes only.
     return {name: value for name, value in named.items() if value != math.inf}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mathota_envs.camera import Camera, default_camera
 from mathota_envs.render import _render, render, render_rgb
-from mathota_jax import Box, Capsule, Plane, SceneBuilder, Sphere
+from mathota_jax import Box, Capsule, Compound, Plane, SceneBuilder, Sphere
 
 WIDTH, HEIGHT = 160, 120
 FIELD_OF_VIEW = math.radians(50.0)
@@ -115,6 +115,22 @@ def test_silhouettes_are_the_pinhole_projections(kind):
         assert truth.sum() > 100
         # float32 may decide a pixel differently only where the edge passes through its centre.
         assert (seen != truth).sum() <= 2
+
+
+def test_a_compound_looks_like_its_shapes_each_at_its_place():
+    """A box and a capsule on one body, against the same two shapes as separate bodies."""
+    offset = {"box": np.array([0.6, 0.2, -0.1]), "capsule": np.array([-0.3, 0.5, 0.4])}
+    turn = {"box": np.array([0.8, 0.6, 0.0, 0.0]), "capsule": np.array([0.6, 0.0, 0.0, 0.8])}
+    position = np.array([0.2, 1.0, -0.3])
+    compound = Compound([(SHAPES[kind], (offset[kind], turn[kind])) for kind in offset])
+    camera = Camera((1.5, 2.0, 5.0), (0, 1, 0), (0, 1, 0), FIELD_OF_VIEW)
+    whole = render_rgb(*build((compound, {"position": position})), WIDTH, HEIGHT, camera)
+    apart = [(SHAPES[kind], {"position": position + offset[kind], "orientation": turn[kind]}) for kind in offset]
+    parts = render_rgb(*build(*apart), WIDTH, HEIGHT, camera)
+    sky = render_rgb(*build((SHAPES["sphere"], {"position": (0, -50, 0)})), WIDTH, HEIGHT, camera)
+    seen, expected = (picture != sky for picture in (whole, parts))
+    assert 500 < expected.any(-1).sum()
+    assert (seen.any(-1) != expected.any(-1)).sum() <= 2
 
 
 def test_sphere_on_the_axis_is_a_disc_of_the_closed_form_radius():

@@ -137,6 +137,21 @@ def test_recordings_are_interpolated_the_short_way_and_hide_what_is_not_finite()
     assert typical == 5
 
 
+PLACED = """(() => {
+  const half = Math.SQRT1_2;
+  const place = placeInBody({ localPosition: [1, 0, 0], localOrientation: [half, 0, 0, half] });
+  const body = poseMatrix([0, 0, 5], [half, 0, half, 0]);
+  return [transform(multiply(body, place), [1, 0, 0]), placeInBody({})];
+})()"""
+
+
+def test_parts_of_compounds_are_placed_in_their_body():
+    point, nowhere = evaluate(PLACED, "vectors.js", "scene_items.js")
+    # The part turns x to y and shifts to (1, 1, 0); the body turns x to -z.
+    assert point == pytest.approx([0, 1, 4, 1], abs=1e-12)
+    assert nowhere == [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
 def test_the_whole_script_parses():
     source = "\n".join((ASSETS / name).read_text(encoding="utf-8") for name in SCRIPTS)
     done = subprocess.run([NODE, "--check", "-"], input=source, capture_output=True, text=True, timeout=60)

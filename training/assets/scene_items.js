@@ -10,6 +10,11 @@ const DIFFUSE = 0.72;
 const DARK_OCTANT = 0.6;
 const SHADOW_STRENGTH = 0.26;
 
+/** Where a part of a compound sits in its body; other shapes have no pose of their own. */
+function placeInBody({ localPosition = [0, 0, 0], localOrientation = [1, 0, 0, 0] }) {
+  return poseMatrix(localPosition, localOrientation);
+}
+
 function createScene(recording) {
   const { data } = recording;
   const [right, up, front] = data.basis;
@@ -17,7 +22,7 @@ function createScene(recording) {
   const light = normalize(add(add(scale(right, LIGHT[0]), scale(up, LIGHT[1])), scale(front, LIGHT[2])));
   const bounded = data.shapes
     .filter((shape) => shape.kind !== "plane")
-    .map((shape) => ({ ...shape, mesh: MESHES[shape.kind](shape) }));
+    .map((shape) => ({ ...shape, mesh: MESHES[shape.kind](shape), place: placeInBody(shape) }));
   const ball = sphereMesh(1);
   const shaft = cylinderMesh(1, 0, 1);
   const head = coneMesh(1, 0, 1);
@@ -26,7 +31,9 @@ function createScene(recording) {
   function solids(time) {
     return bounded.flatMap((shape) => {
       const pose = recording.pose(time, shape.body);
-      return pose ? [{ mesh: shape.mesh, colour: shape.colour, matrix: poseMatrix(pose.position, pose.orientation) }] : [];
+      if (!pose) return [];
+      const matrix = multiply(poseMatrix(pose.position, pose.orientation), shape.place);
+      return [{ mesh: shape.mesh, colour: shape.colour, matrix }];
     });
   }
 
