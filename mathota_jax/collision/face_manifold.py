@@ -16,7 +16,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.closest import clamp
-from mathota_jax.collision.faces import FACES, Face
+from mathota_jax.collision.faces import FACES
 from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.pose import Pose
@@ -48,14 +48,28 @@ DEPTH_TOLERANCE = 5e-10
 class _Face(NamedTuple):
     """A face in the world, from the witness point on; components (corner, pair, world) and (pair, world).
 
-    `outline` are the corners of the polygon that is clipped: a segment broadened to a rectangle.
+    `left` leads from a segment p, q, q, p, ... to the left side of the rectangle that stands for it; None for kinds
+    that have polygons only.
     """
 
     corners: Vec3
-    outline: Vec3
     normal: Vec3
+    left: Vec3 | None
     breadth: Array
     corner_ids: Array
+
+
+class _Outline(NamedTuple):
+    """A face seen along the normal: its corners and, of the polygon to be clipped, corners, edges and inner normals."""
+
+    u: Array
+    v: Array
+    outer_u: Array
+    outer_v: Array
+    along_u: Array
+    along_v: Array
+    inward_u: Array
+    inward_v: Array
 
 
 class _Candidates(NamedTuple):
@@ -107,13 +121,15 @@ def face_manifold(
     swap = FACES[kind_a].flatness < FACES[kind_b].flatness
     normal = contact.normal
     origin = lax.stop_gradient((contact.point_a + contact.point_b) * 0.5)
-    face_a = _world_face(FACES[kind_a].function, a, pose_a, normal, normal, origin)
-    face_b = _world_face(FACES[kind_b].function, b, pose_b, -normal, normal, origin)
+    face_a = _world_face(kind_a, a, pose_a, normal, origin)
+    face_b = _world_face(kind_b, b, pose_b, -normal, origin)
     reference, incident, facing = (face_b, face_a, -1.0) if swap else (face_a, face_b, 1.0)
 
-    frozen = lax.stop_gradient((reference, incident, normal, contact.separation))
-    code, use_witness = _search(*frozen, facing)
-    middle, gap, meeting = _points(reference, incident, normal, code, facing)
+    frozen = lax.stop_gradient((reference, incident, normal))
+    outlines = _outline(frozen[0], normal, facing), _outline(frozen[1], normal, -facing)
+    size = jnp.minimum(_extent(frozen[0]), _extent(frozen[1]))
+    code, use_witness = _search(*frozen, *outlines, lax.stop_gradient(contact.separation), size, facing)
+    middle, gap, meeting = _points(reference, incident, normal, *outlines, code, size, facing)
     feature = _feature_ids(meeting, corner_count(kind_a, a), corner_count(kind_b, b), swap)
 
     witness = (contact.point_a + contact.point_b) * 0.5 - origin
@@ -145,30 +161,52 @@ def witness_feature(kind_a: str, a: dict[str, Any], kind_b: str, b: dict[str, An
     return count_a + count_b + count_a**2 * count_b**2
 
 
-def _world_face(function: Any, shape: dict[str, Any], pose: Pose, outward: Vec3, normal: Vec3, origin: Vec3) -> _Face:
+def _world_face(kind: str, shape: dict[str, Any], pose: Pose, outward: Vec3, origin: Vec3) -> _Face:
     """The face that looks most along `outward` (plus or minus the contact normal)."""
     assert pose.rotation is not None
-    face: Face = function(shape, pose.rotation.apply_transposed(outward))
+    face = FACES[kind].function(shape, pose.rotation.apply_transposed(outward))
     corners = pose.rotation.apply(face.corners) + (pose.position - origin)
-    span = corners.map(lambda c: c[1:2] - c[0:1])
-    # Across a segment, to its left seen from outside; corners p, q, q, p, p, ... move right, right, left, left, ...
-    left = lax.stop_gradient(normalize(cross(outward, span)))
-    side = jnp.where(jnp.arange(corners.x.shape[0]) < 2, -1.0, 1.0).astype(corners.x.dtype)
-    side = side.reshape((-1,) + (1,) * (corners.x.ndim - 1))
-    outline = corners + left * (side * lax.stop_gradient(face.breadth))
-    corners, outline, world_normal = compute_once((corners, outline, pose.rotation.apply(face.normal)), corners.x)
-    return _Face(corners, outline, world_normal, face.breadth, face.corner_ids)
+    corners, world_normal = compute_once((corners, pose.rotation.apply(face.normal)), corners.x)
+    left = None
+    if FACES[kind].flatness < 2:
+        span = corners.map(lambda c: c[1] - c[0])
+        left = lax.stop_gradient(normalize(cross(outward, span)) * face.breadth)
+    return _Face(corners, world_normal, left, lax.stop_gradient(face.breadth), face.corner_ids)
 
 
-def _search(reference: _Face, incident: _Face, normal: Vec3, separation: Array, facing: float) -> tuple[Array, Array]:
+def _outline(face: _Face, normal: Vec3, turn: float) -> _Outline:
+    """Projects a face; `turn` is 1 if it runs counter-clockwise seen against the normal, else -1."""
+    first, second = tangent_basis(lax.stop_gradient(normal))
+    u, v = dot(first, face.corners), dot(second, face.corners)
+    outer_u, outer_v = u, v
+    if face.left is not None:
+        # Corners p, q, q, p, p, ... move right, right, left, left, ...
+        side = jnp.where(jnp.arange(u.shape[0]) < 2, -1.0, 1.0).astype(u.dtype).reshape((-1,) + (1,) * (u.ndim - 1))
+        outer_u, outer_v = u + side * dot(first, face.left), v + side * dot(second, face.left)
+    u, v, outer_u, outer_v = compute_once((u, v, outer_u, outer_v), u)
+    along_u, along_v = _next(outer_u) - outer_u, _next(outer_v) - outer_v
+    length = safe_sqrt(along_u * along_u + along_v * along_v)
+    inward = safe_divide(-turn * along_v, length), safe_divide(turn * along_u, length)
+    return _Outline(u, v, outer_u, outer_v, *compute_once((along_u, along_v, *inward), u))
+
+
+def _search(
+    reference: _Face,
+    incident: _Face,
+    normal: Vec3,
+    reference_outline: _Outline,
+    incident_outline: _Outline,
+    separation: Array,
+    size: Array,
+    facing: float,
+) -> tuple[Array, Array]:
     """Settled codes (4, pair, world) of the points kept, -1 for none, and whether slot 0 is the witness point."""
     number = normal.x.dtype
-    size = jnp.minimum(_extent(reference), _extent(incident))
     cosine_r, cosine_i = dot(reference.normal, normal) * facing, -dot(incident.normal, normal) * facing
     against = jnp.maximum(cosine_r, cosine_i) > ALIGNED_COSINE
     usable = settle_code((against & (jnp.minimum(cosine_r, cosine_i) > STEEP_COSINE)).astype(number)) == 1
-    candidates = _candidates(reference, incident, normal, WIDENING * size, facing, usable)
-    candidates = _Candidates(*compute_once(tuple(candidates), candidates.gap))
+    gaps = _height(reference, incident.corners, normal), _height(incident, reference.corners, normal)
+    candidates = _candidates(reference_outline, incident_outline, *gaps, WIDENING * size, usable)
     first, second = tangent_basis(normal)
     lean = (dot(LEAN, first) * candidates.u + dot(LEAN, second) * candidates.v) * LEAN_SHARE
 
@@ -219,51 +257,48 @@ def _beyond(u: Array, v: Array, along_u: Array, along_v: Array) -> Array:
 
 
 def _candidates(
-    reference: _Face, incident: _Face, normal: Vec3, widening: Array, facing: float, usable: Array
+    reference: _Outline, incident: _Outline, gap: Array, corner_gap: Array, widening: Array, usable: Array
 ) -> _Candidates:
-    first, second = tangent_basis(normal)
-    reference_u, reference_v = dot(first, reference.outline), dot(second, reference.outline)
-    incident_u, incident_v = dot(first, incident.outline), dot(second, incident.outline)
-
-    # Cyrus and Beck (1978): each incident edge (axis 1) against each side of the reference (axis 0).
-    distance = _inside(reference_u[:, None], reference_v[:, None], incident_u, incident_v, facing) + widening
-    rate = _next(distance, 1) - distance
-    crossing = jnp.where(rate != 0, -distance / jnp.where(rate != 0, rate, 1.0), 0.0)
-    missed = (rate == 0) & (distance < 0)
-    enter = jnp.maximum(jnp.max(jnp.where(rate > 0, crossing, 0.0), axis=0), 0.0)
-    leave = jnp.minimum(jnp.min(jnp.where(rate < 0, crossing, 1.0), axis=0), 1.0)
-    kept = (enter <= leave) & ~jnp.any(missed, axis=0) & usable
-    u, v = dot(first, incident.corners), dot(second, incident.corners)
-    gap = _height(reference, incident.corners, normal)
-    step_u, step_v, step_gap = _next(u, 0) - u, _next(v, 0) - v, _next(gap, 0) - gap
-    starts = (u + enter * step_u, v + enter * step_v, gap + enter * step_gap, kept & (enter < 1.0))
+    """Vertices of the patch, from the gaps at the incident and at the reference corners."""
+    distance = _distance(reference, incident.outer_u, incident.outer_v) + widening
+    crossing, rate = _crossing(reference, distance, incident.along_u, incident.along_v)
+    enter = jnp.max(jnp.where(rate > 0, crossing, jnp.where((rate == 0) & (distance < 0), 2.0, 0.0)), axis=0)
+    leave = jnp.min(jnp.where(rate < 0, crossing, 1.0), axis=0)
+    enter, leave = jnp.maximum(enter, 0.0), jnp.minimum(leave, 1.0)
+    edges = incident.u, incident.v, gap
+    starts = [value + enter * (_next(value) - value) for value in edges]
+    ends = [value + leave * (_next(value) - value) for value in edges]
     # An edge that is not cut ends where the next one starts.
-    ends = (u + leave * step_u, v + leave * step_v, gap + leave * step_gap, kept & (leave < 1.0) & (leave > enter))
+    starts.append((enter <= leave) & (enter < 1.0) & usable)
+    ends.append((enter < leave) & (leave < 1.0) & usable)
+    within = jnp.min(_distance(incident, reference.u, reference.v), axis=0)
+    corners = [reference.u, reference.v, corner_gap, (within >= 0) & usable]
 
-    within = jnp.min(_inside(incident_u[:, None], incident_v[:, None], reference_u, reference_v, -facing), axis=0)
-    corners = (
-        dot(first, reference.corners),
-        dot(second, reference.corners),
-        _height(incident, reference.corners, normal),
-        (within >= 0) & usable,
-    )
     fields = []
     for parts in zip(starts, ends, corners, strict=True):
         shape = jnp.broadcast_shapes(*(part.shape[1:] for part in parts))
-        full = [jnp.broadcast_to(part, (part.shape[0], *shape)).astype(u.dtype) for part in parts]
+        full = [jnp.broadcast_to(part, (part.shape[0], *shape)).astype(gap.dtype) for part in parts]
         fields.append(jnp.concatenate(compute_once(full, full[0])))
     return _Candidates(*fields)
 
 
-def _inside(side_u: Array, side_v: Array, u: Array, v: Array, turn: float) -> Array:
-    """Distances of points from the sides (leading axis) of a polygon, positive inside; 0 for sides without length."""
-    along_u, along_v = _next(side_u, 0) - side_u, _next(side_v, 0) - side_v
-    return turn * _beyond(u - side_u, v - side_v, along_u, along_v)
+def _distance(outline: _Outline, u: Array, v: Array) -> Array:
+    """Distances of points (corner, ...) from the sides (leading axis), positive inside; 0 for sides without length."""
+    side_u, side_v, inward_u, inward_v = (
+        x[:, None] for x in (outline.outer_u, outline.outer_v, outline.inward_u, outline.inward_v)
+    )
+    return inward_u * (u - side_u) + inward_v * (v - side_v)
 
 
-def _next(values: Array, axis: int) -> Array:
+def _crossing(outline: _Outline, distance: Array, along_u: Array, along_v: Array) -> tuple[Array, Array]:
+    """Where edges cross the sides, as shares of the edges, and how fast they come inward (M. Cyrus, J. Beck 1978)."""
+    rate = outline.inward_u[:, None] * along_u + outline.inward_v[:, None] * along_v
+    return jnp.where(rate != 0, -distance / jnp.where(rate != 0, rate, 1.0), 0.0), rate
+
+
+def _next(values: Array) -> Array:
     """The values at the following corners."""
-    return jnp.roll(values, -1, axis=axis)
+    return jnp.roll(values, -1, axis=0)
 
 
 def _height(face: _Face, points: Vec3, normal: Vec3) -> Array:
@@ -273,39 +308,42 @@ def _height(face: _Face, points: Vec3, normal: Vec3) -> Array:
 
 
 def _points(
-    reference: _Face, incident: _Face, normal: Vec3, code: Array, facing: float
+    reference: _Face,
+    incident: _Face,
+    normal: Vec3,
+    reference_outline: _Outline,
+    incident_outline: _Outline,
+    code: Array,
+    size: Array,
+    facing: float,
 ) -> tuple[Vec3, Array, _Meeting]:
     """Points midway between the faces, their gaps along the normal and what meets in each; (4, pair, world).
 
     Differentiable but for the codes.
     """
+    number = normal.x.dtype
     count = incident.corners.x.shape[0]
     at_corner = code >= 2 * count
     at_end = (code >= count) & ~at_corner
     edge = jnp.where(at_corner, 0, jnp.where(at_end, code - count, jnp.maximum(code, 0)))
-    start, end, outline_start, outline_end, id_start, id_end = _pick_edge(incident, edge)
+    start, end, id_start, id_end = _pick_edge(incident, edge)
 
     # Which side of the reference cuts the edge: the last one entered, the first one left.
-    frozen_start, frozen_end, frozen_normal = lax.stop_gradient((outline_start, outline_end, normal))
-    first, second = tangent_basis(frozen_normal)
-    outline = jax.tree.map(lambda c: c[:, None], lax.stop_gradient(reference.outline))
-    reference_u, reference_v = dot(first, outline), dot(second, outline)
-    size = jnp.minimum(_extent(reference), _extent(incident))
-    before = _inside(reference_u, reference_v, dot(first, frozen_start), dot(second, frozen_start), facing)
-    after = _inside(reference_u, reference_v, dot(first, frozen_end), dot(second, frozen_end), facing)
-    before, after = before + WIDENING * lax.stop_gradient(size), after + WIDENING * lax.stop_gradient(size)
-    rate = after - before
-    crossing = jnp.where(rate != 0, -before / jnp.where(rate != 0, rate, 1.0), 0.0)
-    number = crossing.dtype
-    lowest = jnp.finfo(number).min
-    entered = jnp.where((rate > 0) & ~at_end, crossing, jnp.where((rate < 0) & at_end, -crossing, lowest))
-    share, side = best_candidate(entered)
+    outer_u, outer_v, along_u, along_v = pick(jax.tree.map(lambda x: x[:, None], incident_outline[2:6]), edge)
+    distance = _distance(reference_outline, outer_u, outer_v) + WIDENING * size
+    crossing, rate = _crossing(reference_outline, distance, along_u, along_v)
+    cuts = jnp.where(at_end, rate < 0, rate > 0)
+    share, side = best_candidate(jnp.where(cuts, jnp.where(at_end, -crossing, crossing), jnp.finfo(number).min))
     crossed = settle_code((~at_corner & (at_end | (share > 0.0))).astype(number)) == 1
     side = jnp.where(at_corner, code - 2 * count, side)
 
-    corner, _, side_start, side_end, id_side, id_next = _pick_edge(reference, side)
+    corner, next_corner, id_side, id_next = _pick_edge(reference, side)
+    along = next_corner - corner
+    if reference.left is not None:  # the short sides of the rectangle
+        last = reference.corners.x.shape[0] - 1
+        along = along + reference.left * jnp.where(side == 1, 2.0, jnp.where(side == last, -2.0, 0.0)).astype(number)
     # Where the edge meets the line of that side, seen along the normal.
-    wall = cross(side_end - side_start, normal)
+    wall = cross(along, normal)
     share = clamp(safe_divide(dot(wall, corner - start), dot(wall, end - start)), 0.0, 1.0)
     on_incident = start + (end - start) * jnp.where(crossed, share, 0.0)
     point = where(at_corner, corner, on_incident)
@@ -315,12 +353,12 @@ def _points(
     return middle, height, _Meeting(at_corner, crossed, id_start, id_end, id_side, id_next)
 
 
-def _pick_edge(face: _Face, index: Array) -> tuple[Vec3, Vec3, Vec3, Vec3, Array, Array]:
-    """Ends of the edge `index` (slot, pair, world), ends of its outline, and their ids."""
-    values = jax.tree.map(lambda c: c[:, None], (face.corners, face.outline, face.corner_ids))
-    corners, outline, ids = pick(values, index)
-    next_corners, next_outline, next_ids = pick(jax.tree.map(lambda c: _next(c, 0), values), index)
-    return corners, next_corners, outline, next_outline, ids, next_ids
+def _pick_edge(face: _Face, index: Array) -> tuple[Vec3, Vec3, Array, Array]:
+    """Ends of the edge `index` (slot, pair, world) and their ids."""
+    corners, ids = jax.tree.map(lambda c: c[:, None], (face.corners, face.corner_ids))
+    start, id_start = pick((corners, ids), index)
+    end, id_end = pick((corners.map(_next), _next(ids)), index)
+    return start, end, id_start, id_end
 
 
 def _feature_ids(meeting: _Meeting, count_a: int, count_b: int, swap: bool) -> Array:
