@@ -345,9 +345,10 @@ def _points(
     # Where the edge meets the line of that side, seen along the normal.
     wall = cross(along, normal)
     share = clamp(safe_divide(dot(wall, corner - start), dot(wall, end - start)), 0.0, 1.0)
-    on_incident = start + (end - start) * jnp.where(crossed, share, 0.0)
+    on_incident = start + (end - start) * compute_once(jnp.where(crossed, share, 0.0), normal.x)
     point = where(at_corner, corner, on_incident)
     height = jnp.where(at_corner, _height(incident, corner, normal), _height(reference, on_incident, normal))
+    height = compute_once(height, normal.x)
     # From a point on A the gap leads along the normal, from a point on B against it.
     middle = point + normal * (jnp.where(at_corner, 0.5 * facing, -0.5 * facing).astype(number) * height)
     return middle, height, _Meeting(at_corner, crossed, id_start, id_end, id_side, id_next)
