@@ -86,8 +86,10 @@ def signed_distance(shape_a: Any, pose_a: NaturalPose, shape_b: Any, pose_b: Nat
     (one of the one-sided derivatives there). Values and derivatives are finite at every pose.
 
     Args:
-      shape_a, shape_b: a shape such as ``Box((1, 1, 1))`` or a `Geometry`.
-      pose_a, pose_b: ``(position, orientation)`` of each.
+      shape_a: a shape such as ``Box((1, 1, 1))`` or a `Geometry`.
+      pose_a: ``(position, orientation)`` of A.
+      shape_b: as `shape_a`.
+      pose_b: ``(position, orientation)`` of B.
 
     Raises:
       ValueError: not a shape, a pose of the wrong shape, or a pair that can not collide (two planes).
@@ -123,12 +125,16 @@ def time_of_impact(
     """When two shapes that move uniformly touch first, by conservative advancement.
 
     No step can jump over a contact: the shapes advance by the gap over a bound of their approach along the normal,
-    rotation included (B. Mirtich, "Impulse-based Dynamic Simulation", 1996, section 2.3). The derivative of the time is that of the root of
-    the gap, ``dt = -d gap / (d gap / d t)``; it is 0 where nothing is hit.
+    rotation included (B. Mirtich, "Impulse-based Dynamic Simulation", 1996, section 2.3). The derivative of the time is
+    that of the root of the gap, ``dt = -d gap / (d gap / d t)``; it is 0 where nothing is hit.
 
     Args:
-      shape_a, pose_a, shape_b, pose_b: as for `signed_distance`.
-      motion_a, motion_b: ``(velocity, angular_velocity)``, (3,) each [m/s, rad/s], world frame, of the shape's origin.
+      shape_a: a shape or a `Geometry`.
+      pose_a: ``(position, orientation)`` of A.
+      motion_a: ``(velocity, angular_velocity)``, (3,) each [m/s, rad/s], world frame, of the origin of A.
+      shape_b: as `shape_a`.
+      pose_b: as `pose_a`.
+      motion_b: as `motion_a`.
       duration: [s], at least 0.
 
     Raises:
