@@ -17,6 +17,16 @@ from mathota_jax.diagnostics import (
 from mathota_jax.geometry import Box, Capsule, Compound, Cone, Cylinder, Heightfield, Plane, Polyhedron, Sphere
 from mathota_jax.model import Model
 from mathota_jax.options import Options
+from mathota_jax.queries import (
+    ContactManifold,
+    Distance,
+    Geometry,
+    Impact,
+    closest_points,
+    manifold,
+    signed_distance,
+    time_of_impact,
+)
 from mathota_jax.scene import Scene
 from mathota_jax.state import Flag, State, apply_force
 from mathota_jax.step import rollout, step
@@ -28,11 +38,15 @@ __all__ = [
     "Capsule",
     "Compound",
     "Cone",
+    "ContactManifold",
     "Contacts",
     "Cylinder",
+    "Distance",
     "Flag",
+    "Geometry",
     "Heightfield",
     "Hinge",
+    "Impact",
     "Model",
     "Options",
     "Plane",
@@ -45,13 +59,17 @@ __all__ = [
     "State",
     "angular_momentum",
     "apply_force",
+    "closest_points",
     "contact_forces",
     "contacts",
     "energy",
     "joint_position",
     "joint_velocity",
+    "manifold",
     "momentum",
     "raycast",
     "rollout",
+    "signed_distance",
     "step",
+    "time_of_impact",
 ]

@@ -1,0 +1,80 @@
+"""Faces and edges of polyhedra: vertices on the leading axis, incidence known at trace time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.spatial.vector import Vec3, cross, normalize
+
+
+class PolyhedronFaces(NamedTuple):
+    """Faces of polyhedra in their own frame.
+
+    Attributes:
+        corners: Vertices of each face, counter-clockwise from outside; components (corner, face, pair, world).
+        normal: Outward unit normals; components (face, pair, world).
+        center: Mean of the distinct corners; components (face, pair, world).
+    """
+
+    corners: Vec3
+    normal: Vec3
+    center: Vec3
+
+
+def polyhedron_faces(vertices: Vec3, faces: np.ndarray) -> PolyhedronFaces:
+    """Planes of all faces, differentiable in the vertices.
+
+    The normal is Newell's (M. Newell, 1972: the vector area of the polygon), which no short or nearly straight corner
+    upsets.
+
+    Args:
+        vertices: Components (vertex, pair, world).
+        faces: int32 (pair, face, corner); faces of fewer corners repeat their last one.
+    """
+    corners = take_vertices(vertices, np.moveaxis(faces, 0, -1).swapaxes(0, 1))
+    following = take_vertices(vertices, np.roll(np.moveaxis(faces, 0, -1), -1, axis=1).swapaxes(0, 1))
+    first = corners.map(lambda c: c[:1])
+    area = cross(corners - first, following - first).map(lambda c: jnp.sum(c, axis=0))
+    distinct = (faces != np.roll(faces, 1, axis=2)) | (faces.shape[2] == 1)
+    weight = np.moveaxis(distinct / distinct.sum(axis=2, keepdims=True), 0, -1).swapaxes(0, 1)[..., None]
+    center = corners.map(lambda c: jnp.sum(c * jnp.asarray(weight, c.dtype), axis=0))
+    return PolyhedronFaces(corners, normalize(area), center)
+
+
+def take_vertices(vertices: Vec3, indices: np.ndarray) -> Vec3:
+    """Vertices by number.
+
+    Args:
+        vertices: Components (vertex, pair, world).
+        indices: (..., pair); the pair axis of either may be 1.
+
+    Returns:
+        Components (..., pair, world).
+    """
+    pairs = max(indices.shape[-1], vertices.x.shape[1])
+    indices = np.broadcast_to(indices, (*indices.shape[:-1], pairs))
+
+    def take(component: Array) -> Array:
+        rows = np.arange(pairs) if component.shape[1] > 1 else np.zeros(pairs, np.int32)
+        return component[indices, np.broadcast_to(rows, indices.shape)]
+
+    return vertices.map(take)
+
+
+def polyhedron_edges(faces: np.ndarray) -> np.ndarray:
+    """Vertex numbers of all edges, int32 (2, edge, pair); padded to a common count by repeating the first edge.
+
+    Args:
+        faces: int32 (pair, face, corner).
+    """
+    lists = []
+    for polygon in faces:
+        ends = np.stack([polygon, np.roll(polygon, -1, axis=1)], -1).reshape(-1, 2)
+        lists.append(np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0))
+    count = max(len(edges) for edges in lists)
+    padded = [np.concatenate([edges, np.repeat(edges[:1], count - len(edges), axis=0)]) for edges in lists]
+    return np.stack(padded, axis=-1).swapaxes(0, 1).astype(np.int32)

@@ -1,0 +1,218 @@
+"""Queries about two shapes against closed forms: distances, contact points, times of impact, derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import mathota_jax
+from mathota_jax import Box, Capsule, Geometry, Plane, Sphere, closest_points, manifold, signed_distance, time_of_impact
+from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.geometry import SHAPES
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+STILL = (np.zeros(3), np.zeros(3))
+
+
+def at(*position, orientation=UPRIGHT):
+    return np.asarray(position, float), np.asarray(orientation, float)
+
+
+def turned(axis, angle):
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.asarray(axis, float))])
+
+
+def example(kind):
+    points = Rotation.from_rotvec([0.3, 0.2, 0.1]).apply(np.random.default_rng(1).normal(size=(12, 3)))
+    return {
+        "plane": lambda: Plane((0.0, 1.0, 0.0), 0.2),
+        "sphere": lambda: Sphere(0.4),
+        "capsule": lambda: Capsule(0.2, 0.5),
+        "box": lambda: Box((0.3, 0.4, 0.5)),
+        "cylinder": lambda: mathota_jax.Cylinder(0.3, 0.4),
+        "cone": lambda: mathota_jax.Cone(0.3, 0.4),
+        "polyhedron": lambda: mathota_jax.Polyhedron(0.4 * points / np.linalg.norm(points, axis=1)[:, None]),
+        "heightfield": lambda: mathota_jax.Heightfield(np.zeros((3, 3)), 1.0),
+    }[kind]()
+
+
+@pytest.mark.parametrize(
+    ("shape_a", "pose_a", "shape_b", "pose_b", "separation", "normal"),
+    [
+        (Sphere(1.0), at(-1.5, 0, 0), Sphere(1.0), at(1.5, 0, 0), 1.0, (1, 0, 0)),
+        (Sphere(3.0), at(-1, 0, 0), Sphere(3.0), at(3, 0, 0), -2.0, (1, 0, 0)),
+        (Box((2.5, 2.5, 2.5)), at(-1, 0, 0), Box((1.0, 1.0, 1.0)), at(1.5, 0, 0), -1.0, (1, 0, 0)),
+        (Box((2.0, 1.0, 1.0)), at(0, 0, 0), Box((2.0, 1.0, 1.0)), at(3.5, 0, 0), -0.5, (1, 0, 0)),
+        (Sphere(0.5), at(0, 2, 0), Plane((0, 1, 0), 0.25), at(0, 0, 0), 1.25, (0, -1, 0)),
+        (Plane((0, 1, 0), 0.0), at(0, 1, 0, orientation=turned((0, 0, 1), np.pi / 2)), Sphere(0.5), at(-2, 9, 9), 1.5,
+         (-1, 0, 0)),
+        (Capsule(0.1, 1.0), at(0, 0, 0), Capsule(0.2, 1.0), at(0, 0, 1, orientation=turned((0, 0, 1), np.pi / 2)), 0.7,
+         (0, 0, 1)),
+    ],
+)  # fmt: skip
+def test_closed_forms(precision, shape_a, pose_a, shape_b, pose_b, separation, normal, gate):
+    limit = 1e-12 if precision == "float64" else 1e-6
+    for sign, arguments in ((1, (shape_a, pose_a, shape_b, pose_b)), (-1, (shape_b, pose_b, shape_a, pose_a))):
+        found = signed_distance(*arguments)
+        gate("separation", found.separation - separation, limit)
+        gate("normal", found.normal - sign * np.asarray(normal), limit)
+        gate("between the points", found.point_b - found.point_a - separation * found.normal, 4 * limit)
+        np.testing.assert_array_equal(closest_points(*arguments), (found.point_a, found.point_b))
+
+
+@pytest.mark.parametrize(("kind_a", "kind_b"), list(PAIRS))
+def test_every_pair_answers_with_finite_derivatives(float64, kind_a, kind_b):
+    """The derivative by the position of B is the normal (envelope theorem), in either order of the arguments."""
+    shape_a, shape_b = Geometry.of(example(kind_a)), Geometry.of(example(kind_b))
+    pose_a = at(0.1, 0.2, -0.1, orientation=turned((0.6, 0.8, 0.0), 0.4))
+    pose_b = at(0.5, 1.3, 0.3, orientation=turned((0.0, 0.6, 0.8), 0.7))
+
+    def gap(a, pose_a, b, pose_b):
+        return signed_distance(a, pose_a, b, pose_b).separation
+
+    found = signed_distance(shape_a, pose_a, shape_b, pose_b)
+    value, gradient = jax.value_and_grad(gap, argnums=(0, 1, 2, 3))(shape_a, pose_a, shape_b, pose_b)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    np.testing.assert_allclose(gradient[3][0], found.normal, atol=1e-9)
+    np.testing.assert_allclose(gradient[1][0], -found.normal, atol=1e-9)
+    reverse = signed_distance(shape_b, pose_b, shape_a, pose_a)
+    np.testing.assert_allclose(reverse.separation, value, atol=1e-12)
+    np.testing.assert_allclose(reverse.normal, -found.normal, atol=1e-12)
+    points = manifold(shape_a, pose_a, shape_b, pose_b)
+    assert points.active[0]
+    np.testing.assert_allclose(points.separation[points.active].min(), value, atol=1e-12)
+
+
+def test_derivatives_by_sizes(float64):
+    """A radius or half extent that grows closes the gap at the same rate."""
+
+    def gap(sphere, box):
+        return signed_distance(sphere, at(0, 3, 0), box, at(0.2, 0, 0.1)).separation
+
+    sphere, box = Geometry.of(Sphere(0.5)), Geometry.of(Box((1.0, 1.5, 2.0)))
+    by_sphere, by_box = jax.grad(gap, argnums=(0, 1))(sphere, box)
+    np.testing.assert_allclose(by_sphere.parameters["radius"], -1.0, atol=1e-12)
+    np.testing.assert_allclose(by_box.parameters["half_extents"], [0.0, -1.0, 0.0], atol=1e-12)
+
+
+def test_mapped_over_pairs_and_sizes(float64):
+    radii = jnp.linspace(0.1, 0.9, 5)
+    heights = jnp.linspace(1.0, 3.0, 5)
+
+    def gap(radius, height):
+        sphere = dataclasses.replace(Geometry.of(Sphere(1.0)), parameters={"radius": radius})
+        return signed_distance(
+            Plane((0, 1, 0)), at(0, 0, 0), sphere, (jnp.array([0.0, height, 0.0]), jnp.array(UPRIGHT))
+        )
+
+    found = jax.jit(jax.vmap(gap))(radii, heights)
+    np.testing.assert_allclose(found.separation, heights - radii, atol=1e-12)
+    assert found.point_b.shape == (5, 3)
+
+
+def test_box_flat_on_a_box_has_four_contact_points():
+    found = manifold(Box((1, 1, 1)), at(0, 0, 0), Box((0.5, 0.5, 0.5)), at(0, 1.45, 0))
+    assert found.active.all() and found.position.shape == (4, 3)
+    np.testing.assert_allclose(found.separation, -0.05, atol=1e-6)
+    np.testing.assert_allclose(sorted(map(tuple, np.asarray(found.position)[:, [0, 2]].round(5).tolist())),
+                               [(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])  # fmt: skip
+
+
+# ---- time of impact ----------------------------------------------------------------------------------------------
+
+
+def test_two_balls_meet(precision, gate):
+    """Gap 9 less, speed 10: 0.9 s (the case of the parry library)."""
+    found = time_of_impact(
+        Sphere(0.5), at(0, 0, 0), (np.array([10.0, 0, 0]), np.ones(3)), Sphere(0.5), at(10, 0, 0), STILL, 2.0
+    )
+    limit = 1e-12 if precision == "float64" else 1e-6
+    assert found.hit
+    gate("time", found.time - 0.9, limit)
+    gate("gap", found.distance.separation, 20 * limit)
+
+
+def test_rod_swings_onto_a_plane(float64, gate):
+    """The end of a turning rod, L sin(omega t) below its centre, reaches the plane below: rotation alone closes the gap."""
+    length, radius, height, rate = 1.0, 0.05, 0.5, 2.0
+    lying = turned((0, 0, 1), np.pi / 2)  # the rod's axis along -x
+
+    def time(height, rate):
+        return time_of_impact(
+            Plane((0, 1, 0)), at(0, 0, 0), STILL,
+            Capsule(radius, length), (jnp.array([0.0, height, 0.0]), lying), (np.zeros(3), jnp.array([0, 0, rate])), 3.0,
+        ).time  # fmt: skip
+
+    truth = np.arcsin((height - radius) / length) / rate
+    value, (by_height, by_rate) = jax.value_and_grad(time, argnums=(0, 1))(height, rate)
+    gate("time", value - truth, 1e-9)
+    gate("d time / d height", by_height - 1.0 / (rate * np.sqrt(length**2 - (height - radius) ** 2)), 1e-7)
+    gate("d time / d rate", by_rate + truth / rate, 1e-7)
+
+
+def test_no_impact_within_the_duration(float64):
+    for velocity, duration in (((1.0, 0, 0), 1.0), ((-1.0, 0, 0), 5.0), ((0, 1.0, 0), 9.0)):
+        found = time_of_impact(
+            Sphere(0.5),
+            at(0, 0, 0),
+            (np.array(velocity), np.zeros(3)),
+            Box((0.5, 0.5, 0.5)),
+            at(4, 0, 0),
+            STILL,
+            duration,
+        )
+        assert not found.hit and found.time == duration
+
+
+def test_touching_from_the_start():
+    found = time_of_impact(Sphere(1.0), at(0, 0, 0), STILL, Sphere(1.0), at(1, 0, 0), STILL, 1.0)
+    assert found.hit and found.time == 0.0
+
+
+def test_a_bullet_never_passes_through_a_thin_plate(float64, gate):
+    rng = np.random.default_rng(0)
+    speeds = rng.uniform(100, 1000, 64)
+    spins = rng.normal(size=(64, 3)) * 50
+
+    def impact(speed, spin):
+        motion = (jnp.array([1.0, 0.0, 0.0]) * speed, spin)
+        return time_of_impact(
+            Box((0.01, 0.005, 0.005)), at(-5, 0, 0), motion, Box((0.001, 2, 2)), at(0, 0, 0), STILL, 1.0
+        )
+
+    found = jax.vmap(impact)(speeds, spins)
+    assert found.hit.all()
+    gate("time * speed against the reach of the bullet [m]", np.abs(found.time * speeds - 4.99), 0.01)
+    gate("gap", found.distance.separation, 1e-5)
+
+
+# ---- bad input ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ("ball", at(0, 0, 0), Sphere(1), at(0, 0, 0)),
+            "signed_distance: expected one of the shapes Plane, .* got 'ball'",
+        ),
+        ((Sphere(1), (np.zeros(2), np.ones(4)), Sphere(1), at(0, 0, 0)), r"pose_a must be \(position, orientation\)"),
+        ((Sphere(1), at(0, 0, 0), Sphere(1), (np.zeros((5, 3)), np.ones((5, 4)))), "pose_b must be .* use jax.vmap"),
+        ((Plane((0, 1, 0)), at(0, 0, 0), Plane((0, 1, 0)), at(0, 0, 0)), "no distance between a plane and a plane"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        signed_distance(*arguments)
+
+
+def test_bad_motion():
+    with pytest.raises(ValueError, match="motion_b must be"):
+        time_of_impact(Sphere(1), at(0, 0, 0), STILL, Sphere(1), at(3, 0, 0), (np.zeros(3),), 1.0)
+
+
+def test_every_shape_has_an_example():
+    assert all(example(kind).kind == kind for kind in SHAPES)
