@@ -10,7 +10,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import CODES, Difference, difference
 from mathota_jax.collision.convex.epa import epa
-from mathota_jax.collision.convex.gjk import gjk
+from mathota_jax.collision.convex.gjk import Simplex, gjk
 from mathota_jax.collision.convex.polish import Ties, polish
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.spatial.pose import Pose
@@ -85,18 +85,30 @@ def convex_distance(
     )
 
 
-def _search(shapes: Difference):
-    """Closest simplex of two shapes; of overlapping ones after pulling them apart along the least overlap."""
+def _search(shapes: Difference) -> Simplex:
+    """Closest simplex of two shapes; of overlapping ones after pulling them apart along the least overlap.
+
+    Both searches are turns of one loop, so that they are compiled once.
+    """
     number = shapes.position.x.dtype
     curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
     iterations = CURVED_ITERATIONS[str(number)] if curved else POLYTOPE_ITERATIONS
+
+    def turn(index: Array, state: tuple[Simplex, Vec3, Vec3]) -> tuple[Simplex, Vec3, Vec3]:
+        before, start, shift = state
+        wanted = (index == 0) | before.overlap
+        found = gjk(shapes, start, shift, wanted, iterations)
+        kept = jax.tree.map(lambda new, old: jnp.where(wanted, new, old), found, before)
+        deep = (index == 0) & found.overlap
+        least = epa(shapes, deep, PENETRATION_ITERATIONS)
+        kept = kept._replace(overlap=jnp.where(index == 0, found.overlap, before.overlap))
+        return kept, least.direction, where(deep, least.direction * (least.depth + LIFT), shift)
+
     zero = jnp.zeros_like(shapes.position.x)
-    everywhere = zero < 1.0
-    apart = gjk(shapes, shapes.position, Vec3(zero, zero, zero), everywhere, iterations)
-    overlap = apart.overlap
-    depth = epa(shapes, overlap, PENETRATION_ITERATIONS)
-    lifted = gjk(shapes, depth.direction, depth.direction * (depth.depth + LIFT), overlap, iterations)
-    return jax.tree.map(lambda new, old: jnp.where(overlap, new, old), lifted, apart)
+    vector = Vec3(zero, zero, zero)
+    none = jnp.zeros(zero.shape, jnp.int32)
+    simplex = Simplex(vector, (none, none, none), vector, vector, none < 0, none < 0)
+    return lax.fori_loop(0, 2, turn, (simplex, shapes.position, vector))[0]
 
 
 def _feature(ties: Ties) -> Array:

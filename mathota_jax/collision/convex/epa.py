@@ -70,38 +70,31 @@ def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
     lanes = jnp.shape(wanted)
     capacity = len(CORNERS) + iterations
 
-    samples = [_sample(shapes, Vec3(*(jnp.full(lanes, float(c), number) for c in corner))) for corner in CORNERS]
-    rest = jnp.zeros((iterations, *lanes), number)
+    def sample_corner(corner: Array) -> tuple[Vec3, Vec3, Array]:
+        direction = Vec3(*(jnp.broadcast_to(corner[k], lanes) for k in range(3)))
+        return direction, *_sample(shapes, direction)
 
-    def table(vectors: list[Vec3]) -> Vec3:
-        return Vec3(*(jnp.concatenate([jnp.stack(c), rest]) for c in zip(*vectors, strict=True)))
-
-    best, direction = samples[0][1], Vec3(*(jnp.full(lanes, float(c), number) for c in CORNERS[0]))
-    for corner, (_, height) in zip(CORNERS[1:], samples[1:], strict=True):
-        better = height < best
-        best = jnp.where(better, height, best)
-        direction = Vec3(*(jnp.where(better, float(c), d) for c, d in zip(corner, direction, strict=True)))
-    axes = [Vec3(*(jnp.full(lanes, float(c), number) for c in corner)) for corner in CORNERS]
+    axes, points, heights = lax.map(sample_corner, jnp.asarray(CORNERS, number))
+    lowest = settle_code(jnp.argmin(heights, axis=0).astype(number))
     octants = np.array(OCTANTS)
 
-    def stacked(column: int, vectors: list[Vec3]) -> Vec3:
-        return Vec3(*(jnp.stack([vectors[i][k] for i in octants[:, column]]) for k in range(3)))
+    def of_octants(vectors: Vec3) -> tuple[Vec3, ...]:
+        return tuple(vectors.map(lambda c, k=k: c[octants[:, k]]) for k in range(3))
 
-    bounds, _ = _least(
-        tuple(stacked(c, axes) for c in range(3)), tuple(stacked(c, [s[0] for s in samples]) for c in range(3))
-    )
+    bounds, _ = _least(of_octants(axes), of_octants(points))
+    rest = jnp.zeros((iterations, *lanes), number)
     infinite = jnp.full((3 * iterations, *lanes), jnp.inf, number)
     numbers = np.concatenate([octants @ [1, BASE, BASE * BASE], np.zeros(3 * iterations)])
     state = _State(
         turn=jnp.zeros((), jnp.int32),
-        corners=table(axes),
-        points=table([s[0] for s in samples]),
+        corners=axes.map(lambda c: jnp.concatenate([c, rest])),
+        points=points.map(lambda c: jnp.concatenate([c, rest])),
         triangles=jnp.broadcast_to(
             jnp.asarray(numbers, number).reshape(-1, *(1,) * len(lanes)), (len(numbers), *lanes)
         ),
         bounds=jnp.concatenate([bounds, infinite]),
-        best=best,
-        direction=direction,
+        best=_row(heights, lowest),
+        direction=axes.map(lambda c: _row(c, lowest)),
         done=~wanted,
     )
 
@@ -118,12 +111,13 @@ def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
         point, height = _sample(shapes, direction)
 
         new = state.turn + len(CORNERS)
-        children = [(1, 2), (2, 0), (0, 1)]
-        child_bounds, child_names = [], []
-        for side, (i, j) in enumerate(children):
-            child, _ = _least((corners[i], corners[j], direction), (points[i], points[j], point))
-            child_bounds.append(jnp.where((choice == side) | done, jnp.inf, child))
-            child_names.append((indices[i] + BASE * indices[j] + BASE * BASE * new).astype(number))
+        first_corners, second_corners = (_stack([corners[i] for i in ids]) for ids in ((1, 2, 0), (2, 0, 1)))
+        first_points, second_points = (_stack([points[i] for i in ids]) for ids in ((1, 2, 0), (2, 0, 1)))
+        child_bounds, _ = _least((first_corners, second_corners, direction), (first_points, second_points, point))
+        # A sample on a side makes two triangles, not three.
+        void = (jnp.arange(3)[:, None, None] == choice) | done
+        child_bounds = jnp.where(void, jnp.inf, child_bounds)
+        names = [indices[i] + BASE * indices[j] + BASE * BASE * new for i, j in ((1, 2), (2, 0), (0, 1))]
         first = len(OCTANTS) + 3 * state.turn
         bounds = jnp.where((jnp.arange(state.bounds.shape[0])[:, None, None] == slot) & ~done, jnp.inf, state.bounds)
         improves = ~done & (height < state.best)
@@ -131,8 +125,8 @@ def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
             turn=state.turn + 1,
             corners=_put(state.corners, direction, new),
             points=_put(state.points, point, new),
-            triangles=lax.dynamic_update_slice_in_dim(state.triangles, jnp.stack(child_names), first, 0),
-            bounds=lax.dynamic_update_slice_in_dim(bounds, jnp.stack(child_bounds), first, 0),
+            triangles=lax.dynamic_update_slice_in_dim(state.triangles, jnp.stack(names).astype(number), first, 0),
+            bounds=lax.dynamic_update_slice_in_dim(bounds, child_bounds, first, 0),
             best=jnp.where(improves, height, state.best),
             direction=where(improves, direction, state.direction),
             done=done,
@@ -146,6 +140,10 @@ def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
 
 def _row(table: Array, index: Array) -> Array:
     return jnp.take_along_axis(table, index[None], axis=0, mode="promise_in_bounds")[0]
+
+
+def _stack(vectors: list[Vec3]) -> Vec3:
+    return Vec3(*(jnp.stack(components) for components in zip(*vectors, strict=True)))
 
 
 def _put(table: Vec3, value: Vec3, index: Array) -> Vec3:
