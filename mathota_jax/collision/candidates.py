@@ -17,12 +17,21 @@ LEAN_SHARE = 1e-3
 """By this share of the distance along `LEAN`, where the score measures the spread of contacts."""
 
 
-def depth_lean(number: Any) -> float:
-    """The same share where it measures depth: the deepest contact is the deepest to this share of the size.
+def depth_tolerance(number: Any) -> float:
+    """Candidates within this share of the size of the deepest one are equally deep: the farthest along `LEAN` counts.
 
-    More than the tremor of a body at rest, less than the error that matters (a tilt of 2e-7 rad, in float32 8e-6).
+    More than the tremor of a body at rest, less than the error that matters (2e-7 in float64, 8e-6 in float32).
     """
     return max(2e-7, 64.0 * float(jnp.finfo(number).eps))
+
+
+def deepest_candidate(depth: Array, lean: Array, tolerance: Array) -> tuple[Array, Array]:
+    """`best_candidate` of `depth`, ties within `tolerance` being broken by `lean`; the depth returned is the largest."""
+    lowest = jnp.finfo(depth.dtype).min
+    depth = store(depth, depth)
+    best, _ = best_candidate(depth)
+    _, code = best_candidate(jnp.where(depth >= best - tolerance, lean, lowest))
+    return best, code
 
 
 def best_candidate(score: Array) -> tuple[Array, Array]:

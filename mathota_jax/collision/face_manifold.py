@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_lean, pick
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, deepest_candidate, depth_tolerance, pick
 from mathota_jax.collision.closest import clamp
 from mathota_jax.collision.convex import ConvexContact
 from mathota_jax.collision.faces import FACES
@@ -220,12 +220,13 @@ def _search(
         score, code = best_candidate(jnp.where(usable_here, widening - penalty, lowest))
         return jnp.where(score > lowest, code, -1)
 
-    share = depth_lean(number)
-    deepest = winner(-candidates.gap, lowest, -share / LEAN_SHARE * lean)
+    tolerance = depth_tolerance(number) * size
+    depth, deepest = deepest_candidate(jnp.where(candidates.valid > 0, -candidates.gap, lowest), lean, tolerance)
+    deepest = jnp.where(depth > lowest, deepest, -1)
     u0, v0, gap0 = pick((candidates.u, candidates.v, candidates.gap), deepest)
-    # The witness point is deeper than the patch: it lies outside of the polygons, on the rim of a disc.
+    # Is the witness point deeper than the patch? Then it lies outside of the polygons, on the rim of a disc.
     reach = size + norm(incident.corners.map(lambda c: c[0])) + jnp.abs(separation)
-    tolerance = 2.0 * share * reach
+    tolerance = 2.0 * tolerance + 16.0 * jnp.finfo(number).eps * reach
     misses = settle_code(((deepest < 0) | (gap0 > separation + tolerance)).astype(number)) == 1
     u0, v0, gap0 = (jnp.where(misses, value, other) for value, other in ((0.0, u0), (0.0, v0), (separation, gap0)))
 

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_lean, pick
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, deepest_candidate, depth_tolerance, pick
 from mathota_jax.collision.closest import round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
@@ -22,7 +22,7 @@ MERGE_DISTANCE = 1e-5
 
 
 def plane_polyhedron(plane: dict[str, Any], _: Pose, polyhedron: dict[str, Any], pose: Pose) -> Manifold:
-    """Up to four contacts, the deepest vertex (see `depth_lean`) first. The feature is the number of the vertex."""
+    """Up to four contacts, the deepest vertex (see `depth_tolerance`) first. The feature is the number of the vertex."""
     assert pose.rotation is not None
     normal, vertices = plane["normal"], polyhedron["vertices"]
     codes = base_vertices(lax.stop_gradient(vertices), lax.stop_gradient(pose.rotation.apply_transposed(normal)))
@@ -44,7 +44,7 @@ def base_vertices(vertices: Vec3, up: Vec3) -> tuple[Array, Array, Array, Array]
     lean = dot(LEAN, vertices)
     height = dot(vertices, up)
     number = height.dtype
-    _, first = best_candidate(lean * depth_lean(number) - height)
+    _, first = deepest_candidate(-height, lean, depth_tolerance(number) * size)
     lowest = pick(vertices, first)
     offset = vertices - lowest
     rise = dot(offset, up)
