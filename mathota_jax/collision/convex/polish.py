@@ -19,14 +19,15 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.convex.difference import CODES, Difference, Weights, barycentric, combine, unit
+from mathota_jax.collision.convex.difference import CODES, Difference, Weights, barycentric, combine
 from mathota_jax.collision.convex.gjk import Simplex
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle_code
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis, where
 
-NEWTON_STEPS = 5
+POLYTOPE_STEPS, CURVED_STEPS = 4, 8
+"""Most Newton steps; all lanes stop as soon as they have converged."""
 LONGEST_STEP = 0.5
 """Newton steps turn the normal by at most this angle [rad]; a longer one means that the pieces are not the right ones."""
 ROUNDING = 16.0
@@ -53,35 +54,95 @@ class Closest(NamedTuple):
     converged: Array
 
 
+class _Search(NamedTuple):
+    turn: Array
+    normal: Vec3
+    ties: Ties
+    best: Array
+    best_normal: Vec3
+    best_ties: Ties
+    exact: Array
+    done: Array
+
+
 def polish(shapes: Difference, simplex: Simplex) -> Closest:
     """Exact closest points from the pieces of the closest simplex. Differentiable in the shapes."""
     frozen, simplex = lax.stop_gradient((shapes, simplex))
-    ties = distinct(simplex.pieces)
-    curved = _curved(shapes)
-    if curved:
-        found = lax.fori_loop(0, NEWTON_STEPS, lambda _, n: _step(frozen, ties, n), simplex.direction)
-    else:
-        found = _step(frozen, ties, simplex.direction)
-    # The true separation along any direction is a lower bound: the larger, the better.
-    rounding = ROUNDING * float(jnp.finfo(found.x.dtype).eps)
-    before, after = _reach(frozen, simplex.direction), _reach(frozen, found)
-    model = dot(found, frozen.point(ties.pieces[0], found))
-    worse = settle_code((after < before - rounding).astype(found.x.dtype)) == 1
-    start = where(worse, simplex.direction, found)
-    converged = ~worse & (model - after <= 4.0 * rounding)
-
+    rounding = ROUNDING * float(jnp.finfo(shapes.position.x.dtype).eps)
+    found = _find(frozen, simplex, rounding)
+    ties, start = found.best_ties, found.best_normal
+    # The step contributes its derivative only; its value is round-off, which a soft contact would amplify.
     stepped = _step(shapes, ties, start)
-    normal = where(worse, start, stepped)
+    normal = start + where(found.exact, stepped - lax.stop_gradient(stepped), start - start)
     points = [shapes.points(pieces, normal) for pieces in ties.pieces]
     weights = barycentric(*(b - a for a, b in points), ties.two, ties.three)
     result = Closest(
-        normal, combine(weights, [a for a, _ in points]), combine(weights, [b for _, b in points]), ties, converged
+        normal, combine(weights, [a for a, _ in points]), combine(weights, [b for _, b in points]), ties, found.exact
     )
-    best = jnp.where(worse, before, after)
+    best = found.best
     for of_b, kind in enumerate((shapes.kind_a, shapes.kind_b)):
         if SUPPORT[kind].rim_radius is not None:
             result, best = _flat_end(shapes, simplex, result, best, bool(of_b), rounding)
     return result
+
+
+def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
+    """Tied pieces and normal of the solution, by Newton's method with an active set.
+
+    The true separation along any direction is a lower bound of the separation: the best direction seen is kept, and a
+    piece that undercuts the tied ones joins them.
+    """
+
+    def advance(state: _Search) -> _Search:
+        normal = _step(shapes, state.ties, state.normal)
+        points = [shapes.point(pieces, normal) for pieces in state.ties.pieces]
+        model = dot(normal, points[0])
+        extreme, pieces = shapes.least(normal)
+        reach = dot(normal, extreme)
+        turned = normal - state.normal
+        consistent = model - reach <= 4.0 * rounding
+        code = (reach > state.best).astype(reach.dtype) + 2.0 * (reach > state.best - rounding) + 4.0 * consistent
+        code = settle_code(jnp.where(state.done, 0.0, code))
+        better = (code & 1 == 1) | ((code >= 6) & ~state.exact)
+        exact = (code & 4) == 4
+        here = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old),
+            (reach, normal, state.ties, exact),
+            (state.best, state.best_normal, state.best_ties, state.exact),
+        )
+        still = dot(turned, turned) <= rounding * rounding
+        weights = barycentric(*points, state.ties.two, state.ties.three)
+        ties = _join(state.ties, pieces, weights, ~exact)
+        return _Search(state.turn + 1, normal, ties, *here, state.done | ((exact & still if curved else exact)))
+
+    curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
+    extreme, pieces = shapes.least(simplex.direction)
+    reach = dot(simplex.direction, extreme)
+    none = jnp.zeros(reach.shape, bool)
+    state = _Search(
+        jnp.zeros((), jnp.int32),
+        simplex.direction,
+        distinct(simplex.pieces),
+        reach,
+        simplex.direction,
+        _single(pieces),
+        none,
+        none,
+    )
+    return lax.while_loop(
+        lambda s: (s.turn < (CURVED_STEPS if curved else POLYTOPE_STEPS)) & ~jnp.all(s.done), advance, state
+    )
+
+
+def _join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
+    """Adds a piece pair; of three tied ones it replaces the one of the least weight."""
+    first, second, third = ties.pieces
+    wanted = wanted & (pieces != first) & ~(ties.two & (pieces == second)) & ~(ties.three & (pieces == third))
+    lowest = jnp.where(weights[0] <= jnp.minimum(weights[1], weights[2]), 0, jnp.where(weights[1] <= weights[2], 1, 2))
+    slot = jnp.where(ties.three, lowest, jnp.where(ties.two, 2, 1))
+    slot = settle_code(jnp.where(wanted, slot, -1).astype(weights[0].dtype))
+    first, second, third = (jnp.where(slot == k, pieces, old) for k, old in enumerate((first, second, third)))
+    return Ties((first, second, third), ties.two | (slot == 1), ties.three | (slot == 2))
 
 
 def distinct(pieces: tuple[Array, Array, Array]) -> Ties:
@@ -91,10 +152,6 @@ def distinct(pieces: tuple[Array, Array, Array]) -> Ties:
     second, third = jnp.where(repeated, third, second), jnp.where(repeated, first, third)
     two = second != first
     return Ties((first, second, third), two, two & (third != first) & (third != second))
-
-
-def _curved(shapes: Difference) -> bool:
-    return any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
 
 
 def _reach(shapes: Difference, direction: Vec3) -> Array:
@@ -185,7 +242,8 @@ def _flat_end(
     upward = settle_code((dot(lax.stop_gradient(axis), simplex.direction) >= 0).astype(best.dtype)) == 1
     normal = axis * jnp.where(upward, 1.0, -1.0)
     along = _reach(frozen, lax.stop_gradient(normal))
-    chosen = settle_code((along >= best - rounding).astype(best.dtype)) == 1
+    # Off the axis the separation falls with the angle itself, so a near tie means that the end is flat on something.
+    chosen = settle_code((along >= best - rounding / 8.0).astype(best.dtype)) == 1
 
     pieces = frozen.pieces(lax.stop_gradient(normal))
     point_a, point_b = shapes.points(pieces, normal)
