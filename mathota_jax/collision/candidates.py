@@ -9,6 +9,29 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.spatial.settle import settle_code, store
+from mathota_jax.spatial.vector import Vec3
+
+LEAN = Vec3(0.48, 0.36, 0.8)
+"""Unit vector toward which scores lean, so that equally good candidates do not take turns in a tremor."""
+LEAN_SHARE = 1e-3
+"""By this share of the distance along `LEAN`, where the score measures the spread of contacts."""
+
+
+def depth_tolerance(number: Any) -> float:
+    """Candidates within this share of the size of the deepest one are equally deep: the farthest along `LEAN` counts.
+
+    More than the tremor of a body at rest, less than the error that matters (2e-7 in float64, 8e-6 in float32).
+    """
+    return max(2e-7, 64.0 * float(jnp.finfo(number).eps))
+
+
+def deepest_candidate(depth: Array, lean: Array, tolerance: Array) -> tuple[Array, Array]:
+    """`best_candidate` of `depth`, ties within `tolerance` being broken by `lean`; the depth returned is the largest."""
+    lowest = jnp.finfo(depth.dtype).min
+    depth = store(depth, depth)
+    best, _ = best_candidate(depth)
+    _, code = best_candidate(jnp.where(depth >= best - tolerance, lean, lowest))
+    return best, code
 
 
 def best_candidate(score: Array) -> tuple[Array, Array]:

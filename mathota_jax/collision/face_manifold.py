@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.candidates import best_candidate, pick
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, deepest_candidate, depth_tolerance, pick
 from mathota_jax.collision.closest import clamp
+from mathota_jax.collision.convex import ConvexContact
 from mathota_jax.collision.faces import FACES
 from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.spatial.indexing import unstack
@@ -37,12 +38,6 @@ LINE_DISTANCE = 1e-5
 """Points closer than this share of the size to the line through two others add nothing to them."""
 HEIGHT_WEIGHT = 10.0
 """A point higher than the deepest one must widen the patch by this many times the height (see `plane_polyhedron`)."""
-LEAN = Vec3(0.48, 0.36, 0.8)
-LEAN_SHARE = 1e-3
-"""Scores lean to one side by this share, so that equally good points do not take turns in a tremor. The search for the
-deepest point leans by eps^(3/4) only."""
-DEPTH_TOLERANCE = 5e-10
-"""The witness point is kept beside the patch where it is deeper by more than this share of the reach, or 64 eps."""
 
 
 class _Face(NamedTuple):
@@ -99,9 +94,9 @@ def face_manifold(
     kind_b: str,
     b: dict[str, Any],
     pose_b: Pose,
-    contact: Any,
+    contact: ConvexContact,
 ) -> Manifold:
-    """Up to four contacts: the deepest first, then those that span the largest area.
+    """Up to four contacts (see `point_count`): the deepest first, then those that span the largest area.
 
     One point, that of the witnesses, remains where no face lies against the other shape. No separation is less than
     the exact one, since the normal supports both shapes; all are measured along it, without bias.
@@ -113,10 +108,9 @@ def face_manifold(
         kind_a, kind_b: Kinds in `FACES`.
         a, b: Their parameters.
         pose_a, pose_b: Their poses.
-        contact: `normal` (unit, A to B), `separation`, `point_a`, `point_b` of the exact deepest contact.
+        contact: The exact deepest contact.
 
-    Source: guide 7.2; E. Coumans' and S. Crouzet's one routine for all shapes (Bullet, Parry): clip the features that a
-    direction supports.
+    Source: guide 7.2; as in Bullet and Parry one routine clips, for all shapes, the features that a direction supports.
     """
     swap = FACES[kind_a].flatness < FACES[kind_b].flatness
     normal = contact.normal
@@ -128,17 +122,16 @@ def face_manifold(
     frozen = lax.stop_gradient((reference, incident, normal))
     outlines = _outline(frozen[0], normal, facing), _outline(frozen[1], normal, -facing)
     size = jnp.minimum(_extent(frozen[0]), _extent(frozen[1]))
-    code, use_witness = _search(*frozen, *outlines, lax.stop_gradient(contact.separation), size, facing)
+    slots = point_count(kind_a, kind_b)
+    code, use_witness = _search(*frozen, *outlines, lax.stop_gradient(contact.separation), size, facing, slots)
     middle, gap, meeting = _points(reference, incident, normal, *outlines, code, size, facing)
     feature = _feature_ids(meeting, corner_count(kind_a, a), corner_count(kind_b, b), swap)
 
     witness = (contact.point_a + contact.point_b) * 0.5 - origin
-    slots = middle.map(lambda c: unstack(c, 0))
+    positions = [Vec3(*components) for components in zip(*(unstack(c, 0) for c in middle), strict=True)]
     points = []
-    for index, (separation, number, active) in enumerate(
-        zip(unstack(gap, 0), unstack(feature, 0), unstack(code >= 0, 0), strict=True)
-    ):
-        position = Vec3(slots.x[index], slots.y[index], slots.z[index])
+    fields = positions, unstack(gap, 0), unstack(feature, 0), unstack(code >= 0, 0)
+    for index, (position, separation, number, active) in enumerate(zip(*fields, strict=True)):
         if index == 0:
             position = where(use_witness, witness, position)
             separation = jnp.where(use_witness, contact.separation, separation)
@@ -148,11 +141,15 @@ def face_manifold(
     return Manifold(normal, tuple(points))
 
 
+def point_count(kind_a: str, kind_b: str) -> int:
+    """Slots of the manifold of two kinds: two where one of them has no flat face."""
+    return 2 if min(FACES[kind_a].flatness, FACES[kind_b].flatness) == 0 else 4
+
+
 def corner_count(kind: str, shape: dict[str, Any]) -> int:
     """How many corner ids the faces of a shape use."""
-    if kind == "polyhedron":
-        return shape["vertices"].x.shape[0]
-    return {"capsule": 2, "box": 8, "cylinder": 18, "cone": 10}[kind]
+    count = FACES[kind].corner_count
+    return shape["vertices"].x.shape[0] if count is None else count
 
 
 def witness_feature(kind_a: str, a: dict[str, Any], kind_b: str, b: dict[str, Any]) -> int:
@@ -165,7 +162,8 @@ def _world_face(kind: str, shape: dict[str, Any], pose: Pose, outward: Vec3, ori
     """The face that looks most along `outward` (plus or minus the contact normal)."""
     assert pose.rotation is not None
     face = FACES[kind].function(shape, pose.rotation.apply_transposed(outward))
-    corners = pose.rotation.apply(face.corners) + (pose.position - origin)
+    corners = compute_once(face.corners, origin.x)
+    corners = pose.rotation.apply(corners) + (pose.position - origin)
     corners, world_normal = compute_once((corners, pose.rotation.apply(face.normal)), corners.x)
     left = None
     if FACES[kind].flatness < 2:
@@ -199,8 +197,9 @@ def _search(
     separation: Array,
     size: Array,
     facing: float,
+    slots: int,
 ) -> tuple[Array, Array]:
-    """Settled codes (4, pair, world) of the points kept, -1 for none, and whether slot 0 is the witness point."""
+    """Settled codes (slot, pair, world) of the points kept, -1 for none, and whether slot 0 is the witness point."""
     number = normal.x.dtype
     cosine_r, cosine_i = dot(reference.normal, normal) * facing, -dot(incident.normal, normal) * facing
     against = jnp.maximum(cosine_r, cosine_i) > ALIGNED_COSINE
@@ -212,7 +211,7 @@ def _search(
 
     both_segments = jnp.minimum(reference.breadth, incident.breadth) > 0
     breadth = reference.breadth + incident.breadth
-    merge = jnp.where(both_segments, 4.0 * breadth, MERGE_DISTANCE * size)
+    merge = jnp.where(both_segments, 6.0 * breadth, MERGE_DISTANCE * size)
     line = LINE_DISTANCE * size + 3.0 * breadth
     lowest = jnp.finfo(number).min
 
@@ -221,11 +220,13 @@ def _search(
         score, code = best_candidate(jnp.where(usable_here, widening - penalty, lowest))
         return jnp.where(score > lowest, code, -1)
 
-    slope = jnp.finfo(number).eps ** 0.75 / LEAN_SHARE
-    deepest = winner(-candidates.gap, lowest, -slope * lean)
+    tolerance = depth_tolerance(number) * size
+    depth, deepest = deepest_candidate(jnp.where(candidates.valid > 0, -candidates.gap, lowest), lean, tolerance)
+    deepest = jnp.where(depth > lowest, deepest, -1)
     u0, v0, gap0 = pick((candidates.u, candidates.v, candidates.gap), deepest)
-    reach = size + norm(pick(incident.corners, jnp.zeros_like(deepest))) + jnp.abs(separation)
-    tolerance = max(DEPTH_TOLERANCE, 64.0 * float(jnp.finfo(number).eps)) * reach
+    # Is the witness point deeper than the patch? Then it lies outside of the polygons, on the rim of a disc.
+    reach = size + norm(incident.corners.map(lambda c: c[0])) + jnp.abs(separation)
+    tolerance = 2.0 * tolerance + 16.0 * jnp.finfo(number).eps * reach
     misses = settle_code(((deepest < 0) | (gap0 > separation + tolerance)).astype(number)) == 1
     u0, v0, gap0 = (jnp.where(misses, value, other) for value, other in ((0.0, u0), (0.0, v0), (separation, gap0)))
 
@@ -234,6 +235,11 @@ def _search(
     second_code = winner(safe_sqrt(du * du + dv * dv), merge, penalty)
     u1, v1 = pick((du, dv), second_code)
     beyond = _beyond(du, dv, u1, v1)
+    # A patch of no extent is the witness point.
+    alone = misses | (second_code < 0)
+    codes = [jnp.where(alone, -1, deepest), second_code]
+    if slots == 2:
+        return jnp.stack(codes), alone
     third_code = winner(jnp.abs(beyond), jnp.where(second_code < 0, jnp.inf, line), penalty)
     u2, v2 = pick((du, dv), third_code)
     turn = jnp.where(u1 * v2 - v1 * u2 > 0, -1.0, 1.0).astype(number)
@@ -242,7 +248,7 @@ def _search(
         jnp.maximum(turn * _beyond(du - u1, dv - v1, u2 - u1, v2 - v1), -turn * _beyond(du, dv, u2, v2)),
     )
     fourth_code = winner(outside, jnp.where(third_code < 0, jnp.inf, line), penalty)
-    return jnp.stack([jnp.where(misses, -1, deepest), second_code, third_code, fourth_code]), misses
+    return jnp.stack([*codes, third_code, fourth_code]), alone
 
 
 def _extent(face: _Face) -> Array:
@@ -317,7 +323,7 @@ def _points(
     size: Array,
     facing: float,
 ) -> tuple[Vec3, Array, _Meeting]:
-    """Points midway between the faces, their gaps along the normal and what meets in each; (4, pair, world).
+    """Points midway between the faces, their gaps along the normal and what meets in each; (slot, pair, world).
 
     Differentiable but for the codes.
     """
@@ -326,6 +332,7 @@ def _points(
     at_corner = code >= 2 * count
     at_end = (code >= count) & ~at_corner
     edge = jnp.where(at_corner, 0, jnp.where(at_end, code - count, jnp.maximum(code, 0)))
+    edge = settle_code(edge.astype(number))
     start, end, id_start, id_end = _pick_edge(incident, edge)
 
     # Which side of the reference cuts the edge: the last one entered, the first one left.
@@ -335,7 +342,7 @@ def _points(
     cuts = jnp.where(at_end, rate < 0, rate > 0)
     share, side = best_candidate(jnp.where(cuts, jnp.where(at_end, -crossing, crossing), jnp.finfo(number).min))
     crossed = settle_code((~at_corner & (at_end | (share > 0.0))).astype(number)) == 1
-    side = jnp.where(at_corner, code - 2 * count, side)
+    side = settle_code(jnp.where(at_corner, code - 2 * count, side).astype(number))
 
     corner, next_corner, id_side, id_next = _pick_edge(reference, side)
     along = next_corner - corner

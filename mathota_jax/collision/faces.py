@@ -56,10 +56,12 @@ class FaceKind(NamedTuple):
     Attributes:
         function: See `FaceFunction`.
         flatness: 2 polygons only, 1 polygons and segments, 0 segments only.
+        corner_count: How many corner ids there are; None: one for each vertex of the shape.
     """
 
     function: FaceFunction
     flatness: int
+    corner_count: int | None
 
 
 def box_face(box: dict[str, Any], direction: Vec3) -> Face:
@@ -189,9 +191,9 @@ def _segment(start: Vec3, end: Vec3, count: int) -> tuple[Vec3, Array]:
 
 
 FACES: dict[str, FaceKind] = {
-    "capsule": FaceKind(capsule_face, 0),
-    "box": FaceKind(box_face, 2),
-    "cylinder": FaceKind(cylinder_face, 1),
-    "cone": FaceKind(cone_face, 1),
-    "polyhedron": FaceKind(polyhedron_face, 2),
+    "capsule": FaceKind(capsule_face, 0, 2),
+    "box": FaceKind(box_face, 2, 8),
+    "cylinder": FaceKind(cylinder_face, 1, 2 * ROUND_CORNERS + 2),
+    "cone": FaceKind(cone_face, 1, ROUND_CORNERS + 2),
+    "polyhedron": FaceKind(polyhedron_face, 2, None),
 }
