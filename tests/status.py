@@ -59,7 +59,7 @@ FEATURES = (
     Feature("stable-baselines3 `VecEnv`", "mathota_envs:sb3", "envs"),
     Feature("training with PPO on the device", "training:ppo", "training"),
     Feature("ball, fixed and distance joints", "mathota_jax:BallAndSocket", "physics/test_joints.py"),
-    Feature("GJK and EPA for general convex shapes", "mathota_jax.collision:gjk", "unit/test_gjk.py"),
+    Feature("GJK and EPA for general convex shapes", "mathota_jax.collision:convex", "unit/test_convex.py"),
     Feature("sleeping and islands", "mathota_jax.dynamics:sleep", "physics/test_sleep.py"),
     Feature("substepped soft contacts", "mathota_jax.solver:soft_step", "physics/test_soft_step.py"),
     Feature("articulated trees", "mathota_jax.dynamics:articulated", "physics/test_articulated.py"),
@@ -90,6 +90,15 @@ def status() -> str:
     kinds = list(SHAPES)
     lines = ["| contact points | " + " | ".join(kinds) + " |", "|---|" + "---|" * len(kinds)]
     lines += [f"| **{first}** | " + " | ".join(_pair(first, second) for second in kinds) + " |" for first in kinds]
+    lines += ["", "| method | pairs |", "|---|---|"]
+    for method in dict.fromkeys(pair.method for pair in PAIRS.values()):
+        cells = ", ".join(f"{a}-{b}" for (a, b), pair in PAIRS.items() if pair.method == method)
+        lines.append(f"| {method} | {cells} |")
+    lines += [
+        "",
+        "Every pair is differentiable in poses and sizes (away from changes of the closest features). Closed forms and",
+        "separating axes are exact to round-off; the iterative pairs are polished to it and raise a flag if they are not.",
+    ]
     lines += ["", "A compound is several of these on one body. Planes and heightfields never move, so they never meet."]
     present = [feature for feature in FEATURES if exists(feature)]
     lines += ["", "| works | tested in |", "|---|---|"]

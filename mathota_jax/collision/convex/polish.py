@@ -113,7 +113,7 @@ def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
         still = dot(turned, turned) <= rounding * rounding
         weights = barycentric(*points, state.ties.two, state.ties.three)
         ties = _join(state.ties, pieces, weights, ~exact)
-        return _Search(state.turn + 1, normal, ties, *here, state.done | ((exact & still if curved else exact)))
+        return _Search(state.turn + 1, normal, ties, *here, state.done | (exact & still if curved else exact))
 
     curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
     extreme, pieces = shapes.least(simplex.direction)

@@ -1,4 +1,4 @@
-"""Analytic contact of pairs of shapes; `PAIRS` is the registry. One file a pair, body A is the earlier kind."""
+"""Contact of pairs of shapes; `PAIRS` is the registry. One file a closed form, body A is the earlier kind."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -6,11 +6,18 @@ from mathota_jax.collision.manifold import Manifold
 from mathota_jax.collision.pairs.box_box import box_box
 from mathota_jax.collision.pairs.capsule_box import capsule_box
 from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule
+from mathota_jax.collision.pairs.convex import convex_pair, convex_point_count
 from mathota_jax.collision.pairs.plane_box import plane_box
 from mathota_jax.collision.pairs.plane_capsule import plane_capsule
+from mathota_jax.collision.pairs.plane_cone import plane_cone
+from mathota_jax.collision.pairs.plane_cylinder import plane_cylinder
+from mathota_jax.collision.pairs.plane_polyhedron import plane_polyhedron
 from mathota_jax.collision.pairs.plane_sphere import plane_sphere
 from mathota_jax.collision.pairs.sphere_box import sphere_box
 from mathota_jax.collision.pairs.sphere_capsule import sphere_capsule
+from mathota_jax.collision.pairs.sphere_cone import sphere_cone
+from mathota_jax.collision.pairs.sphere_cylinder import sphere_cylinder
+from mathota_jax.collision.pairs.sphere_polyhedron import sphere_polyhedron
 from mathota_jax.collision.pairs.sphere_sphere import sphere_sphere
 from mathota_jax.spatial.pose import Pose
 
@@ -23,23 +30,43 @@ class PairFunction(Protocol):
         ...
 
 
+CONVEX = ("capsule", "box", "cylinder", "cone", "polyhedron")
+"""Kinds that meet each other by their support functions where no closed form is registered."""
+
+CLOSED_FORM = "closed form"
+SEPARATING_AXES = "separating axes, clipping"
+ITERATIVE = "GJK, EPA, clipping"
+
+
 class Pair(NamedTuple):
-    """How to test a pair of kinds, and how many contact points the answer has."""
+    """How to test a pair of kinds, how many contact points the answer has, and by which method it is found."""
 
     function: PairFunction
     point_count: int
+    method: str = CLOSED_FORM
+
+
+def _convex(kind_a: str, kind_b: str) -> Pair:
+    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), ITERATIVE)
 
 
 PAIRS: dict[tuple[str, str], Pair] = {
     ("plane", "sphere"): Pair(plane_sphere, 1),
     ("plane", "capsule"): Pair(plane_capsule, 2),
     ("plane", "box"): Pair(plane_box, 4),
+    ("plane", "cylinder"): Pair(plane_cylinder, 4),
+    ("plane", "cone"): Pair(plane_cone, 4),
+    ("plane", "polyhedron"): Pair(plane_polyhedron, 4),
     ("sphere", "sphere"): Pair(sphere_sphere, 1),
     ("sphere", "capsule"): Pair(sphere_capsule, 1),
     ("sphere", "box"): Pair(sphere_box, 1),
+    ("sphere", "cylinder"): Pair(sphere_cylinder, 1),
+    ("sphere", "cone"): Pair(sphere_cone, 1),
+    ("sphere", "polyhedron"): Pair(sphere_polyhedron, 1),
     ("capsule", "capsule"): Pair(capsule_capsule, 2),
     ("capsule", "box"): Pair(capsule_box, 2),
-    ("box", "box"): Pair(box_box, 4),
+    ("box", "box"): Pair(box_box, 4, SEPARATING_AXES),
 }
+PAIRS |= {(a, b): _convex(a, b) for k, a in enumerate(CONVEX) for b in CONVEX[k:] if (a, b) not in PAIRS}
 
 __all__ = ["PAIRS", "Pair", "PairFunction"]
