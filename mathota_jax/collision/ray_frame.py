@@ -9,6 +9,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.spatial.pose import Pose
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, dot
 
 PARALLEL = 1e-15
@@ -44,7 +45,7 @@ def local_ray(pose: Pose, origin: Vec3, direction: Vec3) -> LocalRay:
     else:
         start, heading = pose.point_to_local(origin), pose.rotation.apply_transposed(direction)
     begin = dot(start, heading)
-    return LocalRay(start - heading * begin, heading, begin)
+    return compute_once(LocalRay(start - heading * begin, heading, begin), begin)
 
 
 def far(like: Array) -> Array:
