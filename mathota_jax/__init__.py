@@ -13,7 +13,7 @@ from mathota_jax.diagnostics import (
     joint_velocity,
     momentum,
 )
-from mathota_jax.geometry import Box, Capsule, Plane, Sphere
+from mathota_jax.geometry import Box, Capsule, Compound, Cone, Cylinder, Heightfield, Plane, Polyhedron, Sphere
 from mathota_jax.model import Model
 from mathota_jax.options import Options
 from mathota_jax.scene import Scene
@@ -25,12 +25,17 @@ __version__ = "0.1.0"
 __all__ = [
     "Box",
     "Capsule",
+    "Compound",
+    "Cone",
     "Contacts",
+    "Cylinder",
     "Flag",
+    "Heightfield",
     "Hinge",
     "Model",
     "Options",
     "Plane",
+    "Polyhedron",
     "Scene",
     "SceneBuilder",
     "Slider",

@@ -11,16 +11,33 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.quaternion import multiply as multiply_quaternions
 from mathota_jax.spatial.vector import Mat3, Vec3, multiply
 from mathota_jax.state import State
 
 
 class Inertia(NamedTuple):
-    """Mass properties of bodies; `rotation` is None where all bodies are spherical."""
+    """Mass properties of bodies, components of shape (body, world).
+
+    Attributes:
+      inverse_mass: [1/kg].
+      moments: principal moments about the centre of mass [kg m^2].
+      rotation: of the principal axes, world frame; None where all bodies are spherical.
+      frame: principal axes in the body frame; None where they are the axes of all bodies.
+    """
 
     inverse_mass: Array
     moments: Vec3
     rotation: Mat3 | None
+    frame: Quaternion | None = None
+
+    def at(self, orientation: Quaternion) -> Inertia:
+        """The inertia of bodies that are not all spherical, turned to other orientations."""
+        return self._replace(rotation=to_matrix(_principal(orientation, self.frame)))
+
+    def to_body(self, principal: Vec3) -> Vec3:
+        """Components along the axes of the body of a vector given along the principal axes."""
+        return principal if self.frame is None else to_matrix(self.frame).apply(principal)
 
     def apply(self, angular_velocity: Vec3) -> Vec3:
         """Angular momentum of an angular velocity, world frame."""
@@ -71,8 +88,14 @@ def moving(scene: Scene, bodies: Bodies) -> Bodies:
 def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inertia:
     """Mass properties of the moving bodies at the given orientations."""
     mass, moments = take((model.mass, vector(model.inertia)), scene.dynamic_bodies)
-    spherical = all(scene.spherical[body] for body in scene.dynamic_bodies)
-    return Inertia(1.0 / mass, moments, None if spherical else to_matrix(orientation))
+    if all(scene.spherical[body] for body in scene.dynamic_bodies):
+        return Inertia(1.0 / mass, moments, None)
+    frame = None if model.inertia_frame is None else take(quaternion(model.inertia_frame), scene.dynamic_bodies)
+    return Inertia(1.0 / mass, moments, to_matrix(_principal(orientation, frame)), frame)
+
+
+def _principal(orientation: Quaternion, frame: Quaternion | None) -> Quaternion:
+    return orientation if frame is None else multiply_quaternions(orientation, frame)
 
 
 def pack_blocks(linear: Vec3, angular: Vec3 | None) -> Array:

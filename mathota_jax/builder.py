@@ -14,53 +14,15 @@ from jax import Array
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.joint import joint_row_count
 from mathota_jax.constraints.joints import JOINTS
-from mathota_jax.geometry import SHAPES, Plane, Shape
-from mathota_jax.geometry.validation import finite_vector
+from mathota_jax.declarations import UNTURNED, Body, Joint, Motor, boolean, limits, look_up, mass_properties, number
+from mathota_jax.geometry import SHAPES, Compound, Shape
+from mathota_jax.geometry.validation import finite_vector, unit_quaternion
 from mathota_jax.model import Model
 from mathota_jax.options import Options
 from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate, rotate_back
 from mathota_jax.scene import JointEntry, PairGroup, Scene, ShapeEntry
+from mathota_jax.shape_table import ShapeTable, shape_table
 from mathota_jax.state import State
-
-OUT_OF_REACH = 1e9
-"""Joint limit [m] that stands for none."""
-
-
-@dataclasses.dataclass
-class _Body:
-    name: str
-    shape: Shape
-    static: bool
-    collides: bool
-    mass: float
-    inertia: np.ndarray
-    position: np.ndarray
-    orientation: np.ndarray
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
-    friction: float
-    restitution: float
-
-
-@dataclasses.dataclass
-class _Joint:
-    name: str
-    kind: str
-    parent: int
-    child: int
-    anchor_parent: np.ndarray
-    anchor_child: np.ndarray
-    frame_parent: np.ndarray
-    frame_child: np.ndarray
-    limits: np.ndarray | None
-    damping: float
-
-
-@dataclasses.dataclass
-class _Motor:
-    joint: int
-    limit: float
-    gear: float
 
 
 class SceneBuilder:
@@ -76,13 +38,13 @@ class SceneBuilder:
 
     def __init__(self, gravity: Any = (0.0, -9.8, 0.0)) -> None:
         self._gravity = finite_vector("SceneBuilder.gravity", gravity)
-        self._bodies: list[_Body] = []
-        self._joints: list[_Joint] = []
-        self._motors: list[_Motor] = []
+        self._bodies: list[Body] = []
+        self._joints: list[Joint] = []
+        self._motors: list[Motor] = []
 
     def add_body(
         self,
-        shape: Shape,
+        shape: Shape | Compound,
         *,
         mass: float | None = None,
         density: float | None = None,
@@ -99,16 +61,17 @@ class SceneBuilder:
         """Adds a rigid body and returns its handle.
 
         Args:
-          shape: collision shape, which also gives the volume and the inertia.
+          shape: collision shape, which also gives the volume, the centre of mass and the inertia.
           mass: [kg]; exactly one of `mass` and `density` for a body that moves, neither for a static one.
           density: [kg/m^3].
-          position: (3,) centre [m], world frame.
+          position: (3,) of the origin of the body frame, in which the shape is given [m], world frame. `State.position`
+            is the centre of mass, ``position + R center_of_mass``; the two agree for all but polyhedra and compounds.
           orientation: (4,) quaternion (w, x, y, z), world from body; normalised here.
-          velocity: (3,) [m/s].
+          velocity: (3,) of the centre of mass [m/s].
           angular_velocity: (3,) [rad/s], world frame.
           restitution: Newton coefficient in [0, 1]; a pair uses the smaller of its two.
           friction: Coulomb coefficient, at least 0; a pair uses the geometric mean of its two.
-          static: the body never moves. Planes are static always and must say so.
+          static: the body never moves. Planes and heightfields are static always and must say so.
           collides: False leaves the body out of every contact.
           name: unique name; "body0", "body1", ... by default.
 
@@ -117,35 +80,43 @@ class SceneBuilder:
         """
         name = self._new_name(name, "body", [body.name for body in self._bodies])
         label = f"body '{name}'"
-        if not isinstance(shape, tuple(SHAPES.values())):
-            known = ", ".join(cls.__name__ for cls in SHAPES.values())
+        if not isinstance(shape, (*SHAPES.values(), Compound)):
+            known = ", ".join(cls.__name__ for cls in (*SHAPES.values(), Compound))
             raise ValueError(f"{label}: shape must be one of {known}, got {shape!r}")
-        static = _boolean(f"{label}: static", static)
+        static = boolean(f"{label}: static", static)
         motion = [
             finite_vector(f"{label}: {key}", value)
             for key, value in (("velocity", velocity), ("angular_velocity", angular_velocity))
         ]
-        if isinstance(shape, Plane) and not static:
-            raise ValueError(f"{label}: a Plane is infinite and can not move; pass static=True")
+        infinite = isinstance(shape, Shape) and shape.static_only
+        if infinite and not static:
+            raise ValueError(f"{label}: a {type(shape).__name__} has no mass and can not move; pass static=True")
         if static and any(np.any(value) for value in motion):
             raise ValueError(f"{label}: a static body can not have a velocity")
-        mass_value, inertia = (1.0, np.ones(3)) if static else _mass_properties(label, shape, mass, density)
+        mass_value, inertia, frame = (
+            (1.0, np.ones(3), UNTURNED) if static else mass_properties(label, shape, mass, density)
+        )
         if static and (mass is not None or density is not None):
             raise ValueError(f"{label}: a static body takes neither mass nor density")
+        place = finite_vector(f"{label}: position", position)
+        turn = unit_quaternion(f"{label}: orientation", orientation)
+        center = np.zeros(3) if infinite else shape.center_of_mass()
         self._bodies.append(
-            _Body(
+            Body(
                 name=name,
                 shape=shape,
                 static=static,
-                collides=_boolean(f"{label}: collides", collides),
+                collides=boolean(f"{label}: collides", collides),
                 mass=mass_value,
                 inertia=inertia,
-                position=finite_vector(f"{label}: position", position),
-                orientation=_quaternion(f"{label}: orientation", orientation),
+                inertia_frame=frame,
+                center=center,
+                position=place + rotate(turn, center),
+                orientation=turn,
                 velocity=motion[0],
                 angular_velocity=motion[1],
-                friction=_number(f"{label}: friction", friction, 0.0, math.inf),
-                restitution=_number(f"{label}: restitution", restitution, 0.0, 1.0),
+                friction=number(f"{label}: friction", friction, 0.0, math.inf),
+                restitution=number(f"{label}: restitution", restitution, 0.0, 1.0),
             )
         )
         return len(self._bodies) - 1
@@ -177,15 +148,15 @@ class SceneBuilder:
         anchors = [rotate_back(end.orientation, anchor - end.position) for end in ends]
         frames = [relative_rotation(end.orientation, frame) for end in ends]
         self._joints.append(
-            _Joint(
+            Joint(
                 name,
                 kind,
                 parent,
                 child,
                 *anchors,
                 *frames,
-                limits=_limits(label, joint.limits, JOINTS[kind].angular),
-                damping=_number(f"{label}: damping", joint.damping, 0.0, math.inf),
+                limits=limits(label, joint.limits, JOINTS[kind].angular),
+                damping=number(f"{label}: damping", joint.damping, 0.0, math.inf),
             )
         )
         return len(self._joints) - 1
@@ -203,19 +174,19 @@ class SceneBuilder:
         label = f"motor on joint '{self._joints[index].name}'"
         if kind != "torque":
             raise ValueError(f'{label}: kind must be "torque", got {kind!r}')
-        limit = _number(f"{label}: limit", limit, 0.0, math.inf)
+        limit = number(f"{label}: limit", limit, 0.0, math.inf)
         if limit == 0:
             raise ValueError(f"{label}: limit must be positive, got 0")
-        self._motors.append(_Motor(index, limit, _number(f"{label}: gear", gear, -math.inf, math.inf)))
+        self._motors.append(Motor(index, limit, number(f"{label}: gear", gear, -math.inf, math.inf)))
         return len(self._motors) - 1
 
     def body(self, body: int | str, label: str = "body") -> int:
         """Handle of a body given by handle or name."""
-        return _look_up(label, body, [entry.name for entry in self._bodies], "body")
+        return look_up(label, body, [entry.name for entry in self._bodies], "body")
 
     def joint(self, joint: int | str, label: str = "joint") -> int:
         """Handle of a joint given by handle or name."""
-        return _look_up(label, joint, [entry.name for entry in self._joints], "joint")
+        return look_up(label, joint, [entry.name for entry in self._joints], "joint")
 
     def build(self, options: Options | None = None) -> tuple[Model, State]:
         """Makes the model and its initial state, in JAX's default float precision.
@@ -228,18 +199,18 @@ class SceneBuilder:
             raise ValueError(f"build: options must be an Options, got {options!r}")
         if not self._bodies:
             raise ValueError("build: the scene has no body; call add_body first")
-        shapes, parameters = self._collect_shapes()
-        groups = self._pair_groups(shapes)
-        scene = self._scene(shapes, groups, options)
-        return self._model(scene, parameters, options.dt), self._state(scene)
+        table = shape_table(self._bodies)
+        scene = self._scene(table, self._pair_groups(table.entries), options)
+        return self._model(scene, table, options.dt), self._state(scene)
 
-    def _scene(self, shapes: tuple[ShapeEntry, ...], groups: tuple[PairGroup, ...], options: Options) -> Scene:
+    def _scene(self, table: ShapeTable, groups: tuple[PairGroup, ...], options: Options) -> Scene:
         pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
         bodies = self._bodies
         return Scene(
             static=tuple(body.static for body in bodies),
             spherical=tuple(bool(np.ptp(body.inertia) == 0) for body in bodies),
-            shapes=shapes,
+            shapes=table.entries,
+            faces=table.faces,
             pair_groups=groups,
             joints=tuple(
                 JointEntry(joint.kind, joint.parent, joint.child, joint.limits is not None, joint.damping > 0)
@@ -254,20 +225,23 @@ class SceneBuilder:
             joint_names=tuple(joint.name for joint in self._joints),
         )
 
-    def _model(self, scene: Scene, parameters: dict[str, dict[str, list[np.ndarray]]], dt: float) -> Model:
+    def _model(self, scene: Scene, table: ShapeTable, dt: float) -> Model:
         bodies, joints = self._bodies, self._joints
         unlimited = np.asarray([-np.inf, np.inf])
+        turned = any(np.any(body.inertia_frame != UNTURNED) for body in bodies)
         return Model(
             dt=_floats(dt),
             gravity=_floats(self._gravity),
             mass=_floats([body.mass for body in bodies]),
             inertia=_floats([body.inertia for body in bodies]),
-            size=_floats([1.0 if isinstance(body.shape, Plane) else body.shape.inradius() for body in bodies]),
+            inertia_frame=_floats([body.inertia_frame for body in bodies]) if turned else None,
+            # An infinite body never is the smaller one of a pair.
+            size=_floats([body.shape.inradius() if math.isfinite(body.shape.inradius()) else 1.0 for body in bodies]),
             friction=_floats([body.friction for body in bodies]),
             restitution=_floats([body.restitution for body in bodies]),
             shapes={
-                kind: {key: _floats(np.stack(values)) for key, values in named.items()}
-                for kind, named in parameters.items()
+                kind: {key: _floats(values) for key, values in named.items()}
+                for kind, named in table.parameters.items()
             },
             joint_anchor_parent=_floats([joint.anchor_parent for joint in joints], (0, 3)),
             joint_anchor_child=_floats([joint.anchor_child for joint in joints], (0, 3)),
@@ -294,22 +268,6 @@ class SceneBuilder:
             joint_force=_floats(np.zeros(joint_row_count(scene))),
             flags=jnp.zeros((), jnp.int32),
         )
-
-    def _collect_shapes(self) -> tuple[tuple[ShapeEntry, ...], dict[str, dict[str, list[np.ndarray]]]]:
-        entries: list[ShapeEntry] = []
-        parameters: dict[str, dict[str, list[np.ndarray]]] = {}
-        for index, body in enumerate(self._bodies):
-            values = body.shape.parameters()
-            if isinstance(body.shape, Plane):
-                # Planes are static: their pose is folded in here, and collisions see world coordinates only.
-                normal = rotate(body.orientation, values["normal"])
-                values = {"normal": normal, "offset": values["offset"] + normal @ body.position}
-            named = parameters.setdefault(body.shape.kind, {key: [] for key in values})
-            count = len(next(iter(named.values())))
-            entries.append(ShapeEntry(body.shape.kind, index, count))
-            for key, value in values.items():
-                named[key].append(np.asarray(value))
-        return tuple(entries), parameters
 
     def _pair_groups(self, shapes: tuple[ShapeEntry, ...]) -> tuple[PairGroup, ...]:
         """Admissible pairs: not both static, not joined by a joint, both colliding."""
@@ -360,70 +318,3 @@ def _floats(values: Any, empty_shape: tuple[int, ...] | None = None) -> Array:
     if array.size == 0 and empty_shape is not None:
         array = array.reshape(empty_shape)
     return jnp.asarray(array, jnp.result_type(float))
-
-
-def _mass_properties(label: str, shape: Shape, mass: float | None, density: float | None) -> tuple[float, np.ndarray]:
-    if (mass is None) == (density is None):
-        raise ValueError(f"{label}: give exactly one of mass and density (or static=True)")
-    key, value = ("mass", mass) if density is None else ("density", density)
-    number = _number(f"{label}: {key}", value, 0.0, math.inf)
-    if number == 0:
-        raise ValueError(f"{label}: {key} must be positive, got 0")
-    total = number if density is None else number * shape.volume()
-    return total, total * shape.unit_inertia()
-
-
-def _number(label: str, value: Any, lower: float, upper: float) -> float:
-    is_number = (
-        np.ndim(value) == 0 and isinstance(value, int | float | np.number | Array) and not isinstance(value, bool)
-    )
-    number = float(value) if is_number else math.nan
-    if not math.isfinite(number) or not lower <= number <= upper:
-        bounds = f"between {lower:g} and {upper:g}" if math.isfinite(upper) else f"of at least {lower:g}"
-        bounds = "" if math.isinf(lower) else f" {bounds}"
-        raise ValueError(f"{label} must be a finite number{bounds}, got {value!r}")
-    return number
-
-
-def _boolean(label: str, value: Any) -> bool:
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{label} must be True or False, got {value!r}")
-    return bool(value)
-
-
-def _quaternion(label: str, value: Any) -> np.ndarray:
-    try:
-        array = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        array = np.zeros(0)
-    if array.shape != (4,) or not np.all(np.isfinite(array)) or not np.any(array):
-        raise ValueError(f"{label} must be a finite, nonzero quaternion (w, x, y, z), got {value!r}")
-    return array / np.linalg.norm(array)
-
-
-def _limits(label: str, value: Any, angular: bool) -> np.ndarray | None:
-    if value is None:
-        return None
-    try:
-        limits = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        limits = np.zeros(0)
-    if limits.shape != (2,) or np.any(np.isnan(limits)):
-        raise ValueError(f"{label}: limits must be a pair (lower, upper) of numbers, got {value!r}")
-    if limits[0] > limits[1]:
-        raise ValueError(f"{label}: lower limit {limits[0]:g} is larger than upper limit {limits[1]:g}; swap them")
-    if angular and (limits[0] < -math.pi or limits[1] > math.pi):
-        raise ValueError(f"{label}: limits of a hinge must lie between -pi and pi rad, got {value!r}")
-    # An open side becomes a stop out of reach: an infinite error would turn into NaN in derivatives.
-    return np.clip(limits, -OUT_OF_REACH, OUT_OF_REACH)
-
-
-def _look_up(label: str, handle: Any, names: list[str], noun: str) -> int:
-    known = ", ".join(f"{index} '{name}'" for index, name in enumerate(names)) or "none yet"
-    if isinstance(handle, str):
-        if handle not in names:
-            raise ValueError(f"{label}: no {noun} is called '{handle}'; known: {known}")
-        return names.index(handle)
-    if not isinstance(handle, int | np.integer) or isinstance(handle, bool) or not 0 <= handle < len(names):
-        raise ValueError(f"{label}: no {noun} has the handle {handle!r}; known: {known}")
-    return int(handle)

@@ -19,11 +19,15 @@ class Model:
       dt: () time step [s].
       gravity: (3,) acceleration [m/s^2], world frame.
       mass: (body,) [kg]; 1 for static bodies (not used).
-      inertia: (body, 3) principal moments about the centre of mass along the body axes [kg m^2].
+      inertia: (body, 3) principal moments about the centre of mass [kg m^2].
+      inertia_frame: (body, 4) principal axes in the body frame, quaternion; None where they are the axes of all bodies.
       size: (body,) characteristic length of the body [m] by which tolerances scale (its inner radius).
       friction: (body,) Coulomb coefficient; a pair uses the geometric mean.
       restitution: (body,) Newton coefficient; a pair uses the smaller.
-      shapes: shape kind -> parameter -> (shape of that kind, ...); lengths in m.
+      shapes: shape kind -> parameter -> (shape of that kind, ...); lengths in m. A kind that is not always at the centre
+        of mass along the body axes also has "local_position" (shape, 3) from the centre of mass or "local_orientation"
+        (shape, 4), quaternion, both in the body frame. Vertices of polyhedra are (shape, vertex, 3) from the centre of
+        mass in the body frame, the first one repeated for polyhedra that have fewer than others.
       joint_anchor_parent, joint_anchor_child: (joint, 3) anchor from the centre of mass, body frame [m].
       joint_frame_parent, joint_frame_child: (joint, 4) orientation of the joint frame in each body, quaternion; the x axis
         is the axis of the joint.
@@ -38,6 +42,7 @@ class Model:
     gravity: Array
     mass: Array
     inertia: Array
+    inertia_frame: Array | None
     size: Array
     friction: Array
     restitution: Array

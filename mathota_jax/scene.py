@@ -55,6 +55,7 @@ class Scene:
       static: for each body, whether it never moves.
       spherical: for each body, whether its inertia is the same about every axis.
       shapes: collision shapes in order of adding.
+      faces: for each polyhedron, vertex indices of its polygonal faces, counter-clockwise seen from outside.
       pair_groups: admissible pairs by shape kinds (no static-static, no jointed, no excluded pair).
       joints: joints in order of adding.
       motors: joint that each entry of the action drives.
@@ -67,6 +68,7 @@ class Scene:
     static: tuple[bool, ...]
     spherical: tuple[bool, ...]
     shapes: tuple[ShapeEntry, ...]
+    faces: tuple[tuple[tuple[int, ...], ...], ...]
     pair_groups: tuple[PairGroup, ...]
     joints: tuple[JointEntry, ...]
     motors: tuple[int, ...]

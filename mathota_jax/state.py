@@ -24,7 +24,8 @@ class State:
 
     Attributes:
       position: (body, 3) centres of mass [m], world frame.
-      orientation: (body, 4) unit quaternions (w, x, y, z), world from body.
+      orientation: (body, 4) unit quaternions (w, x, y, z), world from body frame (as given to the builder, whatever the
+        principal axes).
       velocity: (body, 3) of the centres of mass [m/s], world frame.
       angular_velocity: (body, 3) [rad/s], world frame.
       applied_force: (body, 3) force accumulated for the next step [N], world frame.

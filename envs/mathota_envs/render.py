@@ -19,7 +19,7 @@ from jax import Array
 from mathota_envs.camera import Camera, default_camera, validated
 from mathota_envs.ray_shapes import RAY_SHAPES, Placed
 from mathota_envs.scene_description import BOUNDING_RADIUS, PLANE_COLOUR, body_colours, grid_cell
-from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
 
 HORIZON_COLOUR = (0.80, 0.86, 0.91)
@@ -155,8 +155,13 @@ def _groups(
         rows = jnp.array([shape.index for shape in members])
         bodies = jnp.array([shape.body for shape in members])
         size = {name: values[rows] for name, values in sizes[kind].items()}
+        center, turn = Vec3(*position[bodies].T), Quaternion(*orientation[bodies].T)
+        if "local_position" in size:
+            center = center + to_matrix(turn).apply(Vec3(*size.pop("local_position").T))
+        if "local_orientation" in size:
+            turn = multiply(turn, Quaternion(*size.pop("local_orientation").T))
         size = {name: Vec3(*values.T) if values.ndim == 2 else values for name, values in size.items()}
-        placed = Placed(size, Vec3(*position[bodies].T), to_matrix(Quaternion(*orientation[bodies].T)))
+        placed = Placed(size, center, to_matrix(turn))
         tint = [PLANE_COLOUR if kind == "plane" else colours[shape.body] for shape in members]
         groups.append(_Group(kind, len(members), placed, _linear(Vec3(*jnp.array(tint).T))))
     return groups

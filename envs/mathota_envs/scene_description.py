@@ -47,8 +47,10 @@ def scene_description(model: Any) -> list[dict[str, Any]]:
             sizes by kind). The arrays must be concrete.
 
     Returns:
-        One dictionary a shape: ``kind``, ``body``, ``colour`` (sRGB, 0 to 1), ``bounding_radius`` [m] (infinite for a
-        plane) and the sizes of its kind [m], such as ``radius`` or ``half_extents``, as floats or lists of floats.
+        One dictionary a shape: ``kind``, ``body``, ``colour`` (sRGB, 0 to 1), ``bounding_radius`` [m] about the
+        centre of mass of the body (infinite for a plane) and the sizes of its kind [m], such as ``radius`` or
+        ``half_extents``, as floats or lists of floats; also ``local_position`` [m] and ``local_orientation``
+        (quaternion) of the shape in the body where a compound has them.
 
     Raises:
         ValueError: A shape is of a kind that cannot be drawn.
@@ -63,12 +65,13 @@ def scene_description(model: Any) -> list[dict[str, Any]]:
             )
         sizes = model.shapes[shape.kind]
         size = {name: np.asarray(values, dtype=float)[shape.index].tolist() for name, values in sizes.items()}
+        offset = math.hypot(*size.get("local_position", (0.0,)))
         description.append(
             {
                 "kind": shape.kind,
                 "body": int(shape.body),
                 "colour": PLANE_COLOUR if shape.kind == "plane" else colours[shape.body],
-                "bounding_radius": BOUNDING_RADIUS[shape.kind](size),
+                "bounding_radius": offset + BOUNDING_RADIUS[shape.kind](size),
                 **size,
             }
         )

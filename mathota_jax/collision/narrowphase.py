@@ -9,14 +9,10 @@ from jax import Array
 
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.collision.placement import shape_parameters, shape_poses
 from mathota_jax.scene import PairGroup, Scene
-from mathota_jax.spatial.indexing import take, unstack
-from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.quaternion import Quaternion
 from mathota_jax.spatial.vector import Vec3
-
-UNROTATED_KINDS = ("plane", "sphere")
-"""Kinds whose contacts do not depend on the orientation of the body (planes are given in the world frame)."""
 
 
 class ContactSet(NamedTuple):
@@ -39,7 +35,7 @@ def find_contacts(
       shapes: kind -> parameter -> (shape, ..., world).
       position, orientation: of all bodies, components (body, world).
     """
-    groups = [_group_contacts(group, shapes, position, orientation) for group in scene.pair_groups]
+    groups = [_group_contacts(scene, group, shapes, position, orientation) for group in scene.pair_groups]
     if len(groups) == 1:
         return groups[0]
     worlds = max(group.separation.shape[1] for group in groups)
@@ -53,23 +49,13 @@ def _concatenate(values: list[Any], worlds: int) -> Any:
 
 
 def _group_contacts(
-    group: PairGroup, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
+    scene: Scene, group: PairGroup, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
 ) -> ContactSet:
-    def pose(kind: str, bodies: tuple[int, ...]) -> Pose:
-        rotation = None if kind in UNROTATED_KINDS else to_matrix(take(orientation, bodies))
-        return Pose(take(position, bodies), rotation)
-
-    def parameters(kind: str, rows: tuple[int, ...]) -> dict[str, Any]:
-        return {
-            name: Vec3(*unstack(values, 1)) if values.ndim == 3 else values
-            for name, values in take(shapes[kind], rows).items()
-        }
-
     manifold = PAIRS[group.kind_a, group.kind_b].function(
-        parameters(group.kind_a, group.shapes_a),
-        pose(group.kind_a, group.bodies_a),
-        parameters(group.kind_b, group.shapes_b),
-        pose(group.kind_b, group.bodies_b),
+        shape_parameters(scene, shapes, group.kind_a, group.shapes_a),
+        shape_poses(shapes, group.kind_a, group.shapes_a, group.bodies_a, position, orientation),
+        shape_parameters(scene, shapes, group.kind_b, group.shapes_b),
+        shape_poses(shapes, group.kind_b, group.shapes_b, group.bodies_b, position, orientation),
     )
     return _flatten(manifold, len(group.bodies_a))
 

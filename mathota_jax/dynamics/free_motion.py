@@ -36,13 +36,13 @@ def rotate_at_constant_momentum(
 ) -> tuple[Quaternion, Vec3]:
     """Turns bodies for a step during which the angular momentum in the world frame is constant.
 
-    The rotation vector theta of the body frame obeys ``theta' = dexpinv(theta) Omega(theta)`` with the body rate
-    ``Omega = I^-1 exp(-theta) Pi`` for the momentum Pi in the starting body frame. Four Runge-Kutta stages with the
+    The rotation vector theta along the principal axes obeys ``theta' = dexpinv(theta) Omega(theta)`` with the body rate
+    ``Omega = I^-1 exp(-theta) Pi`` for the momentum Pi along the axes at the start. Four Runge-Kutta stages with the
     inverse differential of the exponential cut after its second bracket give order four (H. Munthe-Kaas, "High order
     Runge-Kutta methods on manifolds", Appl. Numer. Math. 29, 1999). The momentum itself is never integrated.
 
     Returns:
-      New orientation, and the rotation vector of the step: in the frame of the body at its start, or in the world frame
+      New orientation, and the rotation vector of the step: along the principal axes at its start, or in the world frame
       where all bodies are spherical and the two agree in effect.
     """
     if inertia.rotation is None:
@@ -62,7 +62,7 @@ def rotate_at_constant_momentum(
     k4 = rate(k3 * dt)
     theta = (k1 + (k2 + k3) * 2.0 + k4) * (dt / 6.0)
     theta = compute_once(theta, start.x)
-    return normalize(multiply(orientation, exponential(theta))), theta
+    return normalize(multiply(orientation, exponential(inertia.to_body(theta)))), theta
 
 
 def _turn_back(theta: Vec3, v: Vec3) -> Vec3:

@@ -2,12 +2,17 @@
 
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
+from mathota_jax.geometry.inertia import MassProperties, centered
+from mathota_jax.geometry.shape import Bounds, Shape, around
 from mathota_jax.geometry.validation import finite_vector
+from mathota_jax.spatial.pose import Pose
+from mathota_jax.spatial.vector import Mat3, Vec3, dot
 
 
-class Box:
+class Box(Shape):
     """Solid box centred at the body origin, edges along the body axes.
 
     Args:
@@ -31,19 +36,28 @@ class Box:
         """Float64 size arrays, which become differentiable leaves of the model."""
         return {"half_extents": self.half_extents.copy()}
 
-    def volume(self) -> float:
-        """Volume [m^3]."""
-        return 8.0 * float(np.prod(self.half_extents))
+    @staticmethod
+    def mass_of(parameters: dict[str, Any]) -> MassProperties:
+        """Moments (hy^2 + hz^2) / 3, ... (guide 2.3)."""
+        half = parameters["half_extents"]
+        x, y, z = half[0], half[1], half[2]
+        return centered(8.0 * x * y * z, [(y**2 + z**2) / 3.0, (z**2 + x**2) / 3.0, (x**2 + y**2) / 3.0])
 
-    def unit_inertia(self) -> np.ndarray:
-        """Principal moments about the centre for unit mass, shape ``(3,)`` [m^2]: (hy^2 + hz^2) / 3, ... (2.3)."""
-        squares = self.half_extents**2
-        return (squares.sum() - squares) / 3.0
+    @staticmethod
+    def bounds_of(parameters: dict[str, Any], pose: Pose) -> Bounds:
+        """Sum of the shadows of the half edges (C. Ericson, "Real-Time Collision Detection", 2005, section 4.2.6)."""
+        assert pose.rotation is not None
+        return around(
+            pose.position, Mat3(*(column.map(jnp.abs) for column in pose.rotation)).apply(parameters["half_extents"])
+        )
 
-    def bounding_radius(self) -> float:
-        """Radius [m] of the smallest centred sphere that contains the shape."""
-        return float(np.linalg.norm(self.half_extents))
+    @staticmethod
+    def reach_of(parameters: dict[str, Any]) -> Any:
+        """Half the diagonal."""
+        half = parameters["half_extents"]
+        half = half if isinstance(half, Vec3) else Vec3(*half)
+        return dot(half, half) ** 0.5
 
     def inradius(self) -> float:
-        """Radius [m] of the largest centred sphere inside the shape: the characteristic length of the body."""
+        """The smallest half extent [m]."""
         return float(self.half_extents.min())

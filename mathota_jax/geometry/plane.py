@@ -2,12 +2,17 @@
 
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
 import numpy as np
 
+from mathota_jax.geometry.inertia import MassProperties
+from mathota_jax.geometry.shape import Bounds, Shape
 from mathota_jax.geometry.validation import finite_number, finite_vector
+from mathota_jax.spatial.pose import Pose
+from mathota_jax.spatial.vector import Vec3
 
 
-class Plane:
+class Plane(Shape):
     """Static half space ``normal . x <= offset``; contacts push along the normal.
 
     Args:
@@ -19,6 +24,7 @@ class Plane:
     """
 
     kind: ClassVar[str] = "plane"
+    static_only: ClassVar[bool] = True
 
     def __init__(self, normal: Any, offset: Any = 0.0) -> None:
         vector = finite_vector("Plane.normal", normal)
@@ -36,17 +42,21 @@ class Plane:
         """Float64 arrays, which become differentiable leaves of the model."""
         return {"normal": self.normal.copy(), "offset": np.array(self.offset)}
 
-    def volume(self) -> float:
+    @staticmethod
+    def mass_of(parameters: dict[str, Any]) -> MassProperties:
         """Raises ValueError: a plane is infinite."""
-        raise ValueError("Plane has no volume; add it with static=True")
+        raise ValueError("Plane has neither volume nor inertia; add it with static=True")
 
-    def unit_inertia(self) -> np.ndarray:
-        """Raises ValueError: a plane is infinite."""
-        raise ValueError("Plane has no inertia; add it with static=True")
+    @staticmethod
+    def bounds_of(parameters: dict[str, Any], pose: Pose) -> Bounds:
+        """Everything."""
+        infinite = Vec3(*[jnp.full_like(parameters["offset"], jnp.inf)] * 3)
+        return Bounds(-infinite, infinite)
 
-    def bounding_radius(self) -> float:
+    @staticmethod
+    def reach_of(parameters: dict[str, Any]) -> Any:
         """Infinite."""
-        return float("inf")
+        return parameters["offset"] * 0.0 + np.inf
 
     def inradius(self) -> float:
         """Infinite: a plane never is the smaller body of a pair."""

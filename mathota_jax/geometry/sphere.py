@@ -4,10 +4,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from mathota_jax.geometry.inertia import MassProperties, centered
+from mathota_jax.geometry.shape import Bounds, Shape, around
 from mathota_jax.geometry.validation import positive_number
+from mathota_jax.spatial.pose import Pose
+from mathota_jax.spatial.vector import Vec3
 
 
-class Sphere:
+class Sphere(Shape):
     """Solid sphere centred at the body origin.
 
     Args:
@@ -29,18 +33,23 @@ class Sphere:
         """Float64 size arrays, which become differentiable leaves of the model."""
         return {"radius": np.array(self.radius)}
 
-    def volume(self) -> float:
-        """Volume [m^3]."""
-        return 4.0 / 3.0 * np.pi * self.radius**3
+    @staticmethod
+    def mass_of(parameters: dict[str, Any]) -> MassProperties:
+        """Moments 2/5 r^2 (guide 2.1)."""
+        r = parameters["radius"]
+        return centered(4.0 / 3.0 * np.pi * r**3, [0.4 * r**2] * 3)
 
-    def unit_inertia(self) -> np.ndarray:
-        """Principal moments about the centre for unit mass, shape ``(3,)`` [m^2]: 2/5 r^2 (guide 2.1)."""
-        return np.full(3, 0.4 * self.radius**2)
+    @staticmethod
+    def bounds_of(parameters: dict[str, Any], pose: Pose) -> Bounds:
+        """The radius to every side."""
+        r = parameters["radius"]
+        return around(pose.position, Vec3(r, r, r))
 
-    def bounding_radius(self) -> float:
-        """Radius [m] of the smallest centred sphere that contains the shape."""
-        return self.radius
+    @staticmethod
+    def reach_of(parameters: dict[str, Any]) -> Any:
+        """The radius."""
+        return parameters["radius"]
 
     def inradius(self) -> float:
-        """Radius [m] of the largest centred sphere inside the shape: the characteristic length of the body."""
+        """The radius [m]."""
         return self.radius
