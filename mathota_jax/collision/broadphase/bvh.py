@@ -22,11 +22,10 @@ from mathota_jax.collision.broadphase.pair_list import (
     Visit,
     collect,
     finite_bounds,
-    gather,
 )
 from mathota_jax.collision.broadphase.ranges import sort_shapes
 from mathota_jax.collision.broadphase.sort_and_sweep import sweep
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.settle import settle, settle_code
 from mathota_jax.spatial.vector import Vec3
 
@@ -37,7 +36,7 @@ def bvh(bounds: Bounds, admissible: Admissible, capacity: int) -> PairList:
     """Candidate pairs by a hierarchy of the static shapes; see `candidate_pairs`."""
     bounds, bad = finite_bounds(bounds)
     static = np.asarray(admissible.static)
-    enumerators = [sweep(bounds, bad | static[:, None])]
+    enumerators = [sweep(bounds, bad, np.flatnonzero(~static))] if not static.all() else []
     if static.any() and not static.all():
         enumerators.append(_descend(bounds, bad, np.flatnonzero(static), np.flatnonzero(~static)))
     return collect(enumerators, bounds, bad, admissible, capacity, ordered=False)

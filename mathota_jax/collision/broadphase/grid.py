@@ -17,9 +17,9 @@ from mathota_jax.collision.broadphase.pair_list import (
     PairList,
     collect,
     finite_bounds,
-    gather,
 )
 from mathota_jax.collision.broadphase.ranges import lower_bound, range_pairs, sort_shapes, upper_bound
+from mathota_jax.spatial.indexing import gather
 from mathota_jax.spatial.settle import settle_code
 
 AXIS_CELLS = 1024

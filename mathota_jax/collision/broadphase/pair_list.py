@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mathota_jax.spatial.indexing import gather
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3
 
@@ -138,13 +139,6 @@ def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
     low, high = low.map(lambda x: jnp.where(finite, x, largest)), high.map(lambda x: jnp.where(finite, x, -largest))
     center, radius = center.map(lambda x: jnp.where(finite, x, 0.0)), jnp.where(finite, radius, 0.0)
     return compute_once(Bounds(low, high, center, radius), radius), ~finite
-
-
-def gather(values: Array, index: Array) -> Array:
-    """Rows of an array (row, world) by an index (place, world) that differs between worlds; valid indices only."""
-    if values.shape[-1] == 1:
-        return values[:, 0].at[index].get(mode="promise_in_bounds")
-    return jnp.take_along_axis(values, index, axis=0, mode="promise_in_bounds")
 
 
 def overlaps(bounds: Bounds, first: Array, second: Array) -> tuple[Array, Array]:

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.broadphase.pair_list import Enumerate, Visit, gather
+from mathota_jax.collision.broadphase.pair_list import Enumerate, Visit
+from mathota_jax.spatial.indexing import gather
 
 SMALLEST_CHUNK = 256
 

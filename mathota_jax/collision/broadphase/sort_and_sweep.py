@@ -7,6 +7,7 @@ Detection" (2005), 7.5, also for the choice of the axis of greatest variance.
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mathota_jax.collision.broadphase.pair_list import (
@@ -16,25 +17,28 @@ from mathota_jax.collision.broadphase.pair_list import (
     PairList,
     collect,
     finite_bounds,
-    gather,
 )
 from mathota_jax.collision.broadphase.ranges import range_pairs, sort_shapes, upper_bound
+from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.settle import settle_code
 
 
 def sort_and_sweep(bounds: Bounds, admissible: Admissible, capacity: int) -> PairList:
     """Candidate pairs by sorting along the axis of the greatest variance; see `candidate_pairs`."""
     bounds, bad = finite_bounds(bounds)
-    return collect([sweep(bounds, bad)], bounds, bad, admissible, capacity, ordered=False)
+    return collect(
+        [sweep(bounds, bad, np.arange(admissible.shape_count))], bounds, bad, admissible, capacity, ordered=False
+    )
 
 
-def sweep(bounds: Bounds, excluded: Array) -> Enumerate:
+def sweep(bounds: Bounds, bad: Array, members: np.ndarray) -> Enumerate:
     """Enumerates the pairs of shapes whose intervals overlap along the best axis of each world.
 
     Args:
-      bounds: from `finite_bounds`.
-      excluded: (shape, world) shapes that are left out.
+      bounds, bad: from `finite_bounds`.
+      members: shapes that take part, ascending.
     """
+    bounds, excluded = take((bounds, bad), members)
     axis = _widest_axis(bounds, ~excluded)
     largest = jnp.finfo(bounds.radius.dtype).max
     low = jnp.where(excluded, largest, jnp.where(axis == 0, bounds.low.x, jnp.where(axis == 1, *bounds.low[1:])))
@@ -42,7 +46,8 @@ def sweep(bounds: Bounds, excluded: Array) -> Enumerate:
     ascending, order = sort_shapes(low)
     place = jnp.arange(low.shape[0], dtype=jnp.int32)[:, None]
     start = jnp.broadcast_to(place + 1, low.shape)
-    return range_pairs(order, order, start, upper_bound(ascending, gather(high, order)) - start)
+    shapes = order if len(members) == members[-1] + 1 else jnp.asarray(members, jnp.int32)[order]
+    return range_pairs(shapes, shapes, start, upper_bound(ascending, gather(high, order)) - start)
 
 
 def _widest_axis(bounds: Bounds, counted: Array) -> Array:
