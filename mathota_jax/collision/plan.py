@@ -40,6 +40,9 @@ def plan_broadphase(
       static, collides, reach: of each body: whether it never moves, whether it has contacts, its bounding radius [m].
       excluded: pairs of bodies that never collide.
       options: `broadphase` and `pair_capacity`.
+
+    Raises:
+      ValueError: kinds that can not collide with each other.
     """
     order = list(SHAPES)
     taking_part = [k for k, entry in enumerate(entries) if collides[entry.body] and entry.kind not in UNPLANNED_KINDS]
@@ -75,7 +78,12 @@ def _groups(shapes: Sequence[tuple[str, bool]], sizes: Sequence[float]) -> tuple
                 pairs = moving_a * fixed_a if a == b else moving_a * fixed_b + moving_b * fixed_a
                 widest = moving_a if a == b else (moving_a if fixed_b else 0) + (moving_b if fixed_a else 0)
                 partners = max(fixed_a, fixed_b)
-            if pairs and (a, b) in PAIRS:
+            if pairs and (a, b) not in PAIRS:
+                raise ValueError(
+                    f"build: shapes of the kinds {a} and {b} can not collide with each other; pass collides=False for the "
+                    "bodies of one of them"
+                )
+            if pairs:
                 tiers = _tiers(widest, partners, side_count, sizes)
                 groups.append(CompactGroup(a, b, PAIRS[a, b].point_count, side_count, tiers))
     return tuple(groups)
