@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.collision.plan import plan_broadphase
 from mathota_jax.constraints.joint import joint_row_count
 from mathota_jax.constraints.joints import JOINTS
 from mathota_jax.declarations import UNTURNED, Body, Joint, Motor, boolean, limits, look_up, mass_properties, number
@@ -200,12 +201,28 @@ class SceneBuilder:
         if not self._bodies:
             raise ValueError("build: the scene has no body; call add_body first")
         table = shape_table(self._bodies)
-        scene = self._scene(table, self._pair_groups(table.entries), options)
+        scene = self._scene(table, options)
         return self._model(scene, table, options.dt), self._state(scene)
 
-    def _scene(self, table: ShapeTable, groups: tuple[PairGroup, ...], options: Options) -> Scene:
-        pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
+    def _scene(self, table: ShapeTable, options: Options) -> Scene:
         bodies = self._bodies
+        joined = {(min(joint.parent, joint.child), max(joint.parent, joint.child)) for joint in self._joints}
+        broadphase = plan_broadphase(
+            table.entries,
+            [body.static for body in bodies],
+            [body.collides for body in bodies],
+            [body.shape.bounding_radius() for body in bodies],
+            sorted(joined),
+            options,
+        )
+        groups = self._pair_groups(table.entries, frozenset(broadphase.shapes) if broadphase else frozenset())
+        pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
+        if broadphase:
+            # Any two that take part may meet: it is enough that one moving body and another one have the property.
+            taking_part = sorted({table.entries[k].body for k in broadphase.shapes})
+            for surface in ("friction", "restitution"):
+                able = [body for body in taking_part if getattr(bodies[body], surface) > 0]
+                pairs += list(itertools.pairwise(able))[:1]
         return Scene(
             static=tuple(body.static for body in bodies),
             spherical=tuple(bool(np.ptp(body.inertia) == 0) for body in bodies),
@@ -223,6 +240,7 @@ class SceneBuilder:
             options=dataclasses.replace(options, dt=Options.dt),
             body_names=tuple(body.name for body in bodies),
             joint_names=tuple(joint.name for joint in self._joints),
+            broadphase=broadphase,
         )
 
     def _model(self, scene: Scene, table: ShapeTable, dt: float) -> Model:
@@ -267,14 +285,20 @@ class SceneBuilder:
             contact_feature=jnp.full(scene.slot_count, -1, jnp.int32),
             joint_force=_floats(np.zeros(joint_row_count(scene))),
             flags=jnp.zeros((), jnp.int32),
+            contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
         )
 
-    def _pair_groups(self, shapes: tuple[ShapeEntry, ...]) -> tuple[PairGroup, ...]:
-        """Admissible pairs: not both static, not joined by a joint, both colliding."""
+    def _pair_groups(self, shapes: tuple[ShapeEntry, ...], planned: frozenset[int]) -> tuple[PairGroup, ...]:
+        """Admissible pairs: not both static, not joined by a joint, both colliding, not both `planned` (broadphase)."""
         joined = {frozenset((joint.parent, joint.child)) for joint in self._joints}
         order = list(SHAPES)
         members: dict[tuple[str, str], list[tuple[ShapeEntry, ShapeEntry]]] = {}
-        for first, second in itertools.combinations(shapes, 2):
+        others = [entry for k, entry in enumerate(shapes) if k not in planned]
+        pairs = itertools.combinations(shapes, 2)
+        if planned:
+            found = [shapes[k] for k in sorted(planned)]
+            pairs = itertools.chain(itertools.combinations(others, 2), itertools.product(others, found))
+        for first, second in pairs:
             one, two = self._bodies[first.body], self._bodies[second.body]
             if (one.static and two.static) or not (one.collides and two.collides):
                 continue

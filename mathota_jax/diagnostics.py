@@ -7,7 +7,8 @@ from jax import Array
 
 from mathota_jax.batching import batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack, vector
-from mathota_jax.collision.narrowphase import find_contacts
+from mathota_jax.collision.narrowphase import find_contacts, join_contacts
+from mathota_jax.constraints import compact
 from mathota_jax.constraints.joint import joint_coordinates
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
@@ -39,7 +40,11 @@ class Contacts:
 
 
 def contacts(model: Model, state: State) -> Contacts:
-    """Contact points of every admissible pair at the present poses. Differentiable in poses and shapes."""
+    """Contact points of every admissible pair at the present poses. Differentiable in poses and shapes.
+
+    In a scene with a broadphase the slots behind those of the pairs that have their own hold the pairs that are close now,
+    in an order of their own: not that of `contact_forces`, which belongs to the last step.
+    """
     return _contacts(model, state)
 
 
@@ -48,10 +53,20 @@ def _contacts(model: Model, state: State) -> Contacts:
     scene = model.scene
     bodies = unpack(state)
     body_a, body_b = (jnp.asarray(side, jnp.int32).reshape(-1, 1) for side in scene.slot_bodies)
-    if not scene.pair_groups:
+    if not scene.slot_count:
         none = state.position[:0, 0]
         return Contacts(state.position[:0], state.position[:0], none, none > 0, none.astype(jnp.int32), body_a, body_b)
-    found = find_contacts(scene, model.shapes, bodies.position, bodies.orientation)
+    parts = []
+    if scene.pair_groups:
+        parts.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
+    if scene.broadphase:
+        close = compact.close_pairs(model, bodies, None)
+        parts += compact.contacts_of(model, bodies, close)
+        body_a, body_b = (
+            jnp.concatenate([jnp.broadcast_to(own, (own.shape[0], more.shape[-1])), more])
+            for own, more in zip((body_a, body_b), compact.slot_bodies(scene, close), strict=True)
+        )
+    found = join_contacts(parts)
     position, normal = (jnp.stack(list(v), axis=1) for v in (found.position, found.normal))
     return Contacts(position, normal, found.separation, found.active, found.feature, body_a, body_b)
 

@@ -6,6 +6,11 @@ import dataclasses
 import math
 from typing import Any
 
+BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
+
+OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1))
+"""Integers that may be None, and their least value."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -24,6 +29,10 @@ class Options:
       position_percent: share of the position error corrected in a step. Guide 10.3.
       baumgarte: share of a joint's position error turned into velocity in a step. Guide 9.5.
       warm_start: start the solver from the impulses of the previous step. Guide 7.3 and 12.4.
+      broadphase: "auto": pairs that can never be many have their own contact slots, the others are found in every step by
+        the method that suits the size of the scene. "none": every pair has its own slots. Or the method: "all_pairs",
+        "sort_and_sweep", "grid", "bvh". Guide 5.4.
+      pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
     """
 
@@ -36,14 +45,16 @@ class Options:
     position_percent: float = 0.8
     baumgarte: float = 0.1
     warm_start: bool = True
+    broadphase: str = "auto"
+    pair_capacity: int | None = None
     gradient_iterations: int | None = None
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and self.dt > 0):
             raise ValueError(f"Options.dt must be a positive finite number of seconds, got {self.dt!r}")
-        for name, minimum in (("velocity_iterations", 1), ("position_iterations", 0), ("gradient_iterations", 1)):
+        for name, minimum in (("velocity_iterations", 1), ("position_iterations", 0), *OPTIONAL):
             value = getattr(self, name)
-            optional = name == "gradient_iterations" and value is None
+            optional = (name, minimum) in OPTIONAL and value is None
             if not optional and not (isinstance(value, int) and not isinstance(value, bool) and value >= minimum):
                 raise ValueError(f"Options.{name} must be an integer of at least {minimum}, got {value!r}")
         for name in ("linear_damping", "angular_damping", "slop"):
@@ -56,6 +67,9 @@ class Options:
                 raise ValueError(f"Options.{name} must lie between 0 and 1, got {value!r}")
         if not isinstance(self.warm_start, bool):
             raise ValueError(f"Options.warm_start must be True or False, got {self.warm_start!r}")
+        if self.broadphase not in BROADPHASE_CHOICES:
+            known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
+            raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")
 
 
 def _is_number(value: Any) -> bool:

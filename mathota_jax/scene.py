@@ -37,6 +37,54 @@ class PairGroup(NamedTuple):
         return len(self.bodies_a) * self.point_count
 
 
+class Tier(NamedTuple):
+    """Turns of equal size in a sweep of the solver over a `CompactGroup`: each holds up to `pair_count` pairs."""
+
+    turn_count: int
+    pair_count: int
+
+
+class CompactGroup(NamedTuple):
+    """Pairs of two shape kinds that own contact slots only while they are close to each other.
+
+    `side_count` is the number of moving bodies in each pair. The places of the pairs are numbered tier, turn, column.
+    """
+
+    kind_a: str
+    kind_b: str
+    point_count: int
+    side_count: int
+    tiers: tuple[Tier, ...]
+
+    @property
+    def place_count(self) -> int:
+        """Pairs that can be close at the same time."""
+        return sum(tier.turn_count * tier.pair_count for tier in self.tiers)
+
+    @property
+    def slot_count(self) -> int:
+        """Contact slots of the group: one for each place and point, place major."""
+        return self.place_count * self.point_count
+
+
+class Broadphase(NamedTuple):
+    """How the pairs that are close are found in every step, in scenes of too many pairs to give each its slots.
+
+    Attributes:
+      method: key of `collision.broadphase.BROADPHASES`.
+      shapes: entries of `Scene.shapes` that take part, by kind; pairs refer to their place in this tuple.
+      excluded: pairs of bodies that never collide.
+      capacity: pairs that can be close at the same time.
+      groups: where their contacts go.
+    """
+
+    method: str
+    shapes: tuple[int, ...]
+    excluded: tuple[tuple[int, int], ...]
+    capacity: int
+    groups: tuple[CompactGroup, ...]
+
+
 class JointEntry(NamedTuple):
     """One joint. `limited` and `damped` say whether its limit and damping rows exist."""
 
@@ -56,13 +104,15 @@ class Scene:
       spherical: for each body, whether its inertia is the same about every axis.
       shapes: collision shapes in order of adding.
       faces: for each polyhedron, vertex indices of its polygonal faces, counter-clockwise seen from outside.
-      pair_groups: admissible pairs by shape kinds (no static-static, no jointed, no excluded pair).
+      pair_groups: admissible pairs by shape kinds (no static-static, no jointed, no excluded pair), but for those that
+        the broadphase finds.
       joints: joints in order of adding.
       motors: joint that each entry of the action drives.
       friction: whether any admissible pair has friction; otherwise there are no tangent rows.
       restitution: whether any admissible pair bounces; otherwise there is no event code.
       options: the settings, `dt` excepted (a leaf of the model).
       body_names, joint_names: for messages and look-up.
+      broadphase: None where every admissible pair has its own slots.
     """
 
     static: tuple[bool, ...]
@@ -77,6 +127,7 @@ class Scene:
     options: Options
     body_names: tuple[str, ...]
     joint_names: tuple[str, ...]
+    broadphase: Broadphase | None = None
 
     @functools.cached_property
     def _key(self) -> tuple:
@@ -103,13 +154,28 @@ class Scene:
         return tuple(body for body, is_static in enumerate(self.static) if not is_static)
 
     @property
-    def slot_count(self) -> int:
-        """Number of contact slots: one for each admissible pair and contact point."""
+    def static_slot_count(self) -> int:
+        """Number of contact slots that belong to a pair: one for each admissible pair and contact point."""
         return sum(group.slot_count for group in self.pair_groups)
+
+    @property
+    def compact_groups(self) -> tuple[CompactGroup, ...]:
+        """Groups of pairs that the broadphase finds."""
+        return () if self.broadphase is None else self.broadphase.groups
+
+    @property
+    def slot_count(self) -> int:
+        """Number of contact slots: those that belong to a pair, then those of the compact groups."""
+        return self.static_slot_count + sum(group.slot_count for group in self.compact_groups)
+
+    @property
+    def place_count(self) -> int:
+        """Number of pairs that the compact groups hold."""
+        return sum(group.place_count for group in self.compact_groups)
 
     @functools.cached_property
     def slot_bodies(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Bodies A and B of each contact slot."""
+        """Bodies A and B of each contact slot that belongs to a pair."""
         return tuple(  # type: ignore[return-value]
             tuple(body for group in self.pair_groups for body in getattr(group, side) for _ in range(group.point_count))
             for side in ("bodies_a", "bodies_b")

@@ -17,6 +17,10 @@ class Flag(enum.IntFlag):
     NON_FINITE = 1
     """A position or velocity of this world became NaN or infinite, or an orientation lost its length."""
 
+    CONTACT_OVERFLOW = 2
+    """More pairs were close to each other than `Options.pair_capacity`, or than fit around one body; the deepest were kept
+    as far as there was room, the others passed through each other in this step."""
+
 
 @pytree
 class State:
@@ -34,6 +38,8 @@ class State:
       contact_feature: (slot,) feature that held each slot in the last step, -1 for none.
       joint_force: (joint row,) mean generalized force of each joint row in the last step [N] or [N m].
       flags: () bits of `Flag`; 0 when all is well.
+      contact_pair: (place,) pair that held each place of the compact groups in the last step, ``first * shapes + second``
+        in the numbering of the broadphase, -1 for none; None in scenes without broadphase.
     """
 
     position: Array
@@ -46,6 +52,7 @@ class State:
     contact_feature: Array
     joint_force: Array
     flags: Array
+    contact_pair: Array | None = None
 
 
 def apply_force(state: State, body: int, force: Array, point: Array | None = None) -> State:

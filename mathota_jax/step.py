@@ -21,8 +21,8 @@ from mathota_jax.bodies import (
     unpack,
     vector,
 )
-from mathota_jax.collision.narrowphase import ContactSet, find_contacts
-from mathota_jax.constraints import contact, joint
+from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
+from mathota_jax.constraints import compact, contact, joint
 from mathota_jax.constraints.assembly import Side, collect
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
@@ -108,6 +108,7 @@ class _Problem(NamedTuple):
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
+    close: compact.ClosePairs | None
 
     @property
     def rows(self) -> tuple[Rows, ...]:
@@ -119,7 +120,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     scene = model.scene
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
-        return _finish(scene, state, bodies, moving(scene, bodies), None, None)
+        return _finish(scene, state, moving(scene, bodies), {})
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     force, torque = _external(model, state, bodies, action)
@@ -131,7 +132,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
-    return _finish(scene, state, bodies, moved, *_forces(model, problem, impulses))
+    return _finish(scene, state, moved, _forces(model, problem, impulses))
 
 
 _batched_step = batch_last(step_worlds_last)
@@ -180,9 +181,15 @@ def _constrain(
         joint_rows = tuple(
             joint.velocity_rows(scene, table, model, joints, middle, inertia) for table in joint.joint_tables(scene)
         )
-    contacts, contact_rows = None, []
-    if scene.pair_groups:
-        contacts = find_contacts(scene, model.shapes, bodies.position, bodies.orientation)
+    contacts, contact_rows, close = None, [], None
+    if scene.slot_count:
+        found = []
+        if scene.pair_groups:
+            found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
+        if scene.broadphase:
+            close = compact.close_pairs(model, bodies, free)
+            found += compact.contacts_of(model, bodies, close)
+        contacts = join_contacts(found)
         contacts = contacts._replace(
             **compute_once(
                 {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation},
@@ -195,7 +202,12 @@ def _constrain(
         contact_rows = [
             contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)
         ]
-    return _Problem(joints, joint_rows, contacts, contact_rows)
+        contact_rows += [
+            contact.contact_rows(scene, table, model, contacts, motion, pairs)
+            for group in (close.groups if close else ())
+            for table, pairs in group.tables
+        ]
+    return _Problem(joints, joint_rows, contacts, contact_rows, close)
 
 
 def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, ...]:
@@ -207,8 +219,13 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
         for rows in problem.joint_rows
     ]
     if problem.contacts is not None:
-        force = contact.matched_force(model.scene, problem.contacts, vector(state.contact_force), state.contact_feature)
-        force = compute_once(force, state.position)
+        old, feature = vector(state.contact_force), state.contact_feature
+        parts = contact.matched_force(model.scene, problem.contacts, old, feature)
+        if problem.close is not None and state.contact_pair is not None:
+            parts += compact.matched_force(
+                model.scene, problem.close, problem.contacts, old, feature, state.contact_pair
+            )
+        force = compute_once(contact.join_forces(parts), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
     return tuple(start)
 
@@ -285,24 +302,25 @@ def _place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:
     return jnp.concatenate(parts)
 
 
-def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> tuple[Array | None, Array | None]:
-    """Mean forces over the step, in the form in which the state keeps them."""
+def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> dict[str, Array]:
+    """Mean forces over the step and what they belong to, in the form in which the state keeps them; new flags."""
     scene, count = model.scene, len(problem.joint_rows)
-    joint_force, contact_force = None, None
+    changes: dict[str, Array] = {}
     if problem.joints is not None:
         tables = [rows.table for rows in problem.joint_rows]
         values = [impulse[:, 0] / model.dt for impulse in impulses[:count]]
-        joint_force = collect(tables, values, joint.joint_row_count(scene))
+        changes["joint_force"] = collect(tables, values, joint.joint_row_count(scene))
     if problem.contacts is not None:
-        force = contact.slot_force(problem.contact_rows, list(impulses[count:]), scene.slot_count, model.dt)
-        feature = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
-        contact_force = (force, feature)
-    return joint_force, contact_force  # type: ignore[return-value]
+        impulses = impulses[count:]
+        changes["contact_force"] = contact.slot_force(problem.contact_rows, list(impulses), scene.slot_count, model.dt)
+        changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
+        if problem.close is not None:
+            changes["contact_pair"] = compact.pair_keys(scene, problem.close)
+            changes["flags"] = jnp.where(problem.close.overflow, int(Flag.CONTACT_OVERFLOW), 0)
+    return changes
 
 
-def _finish(
-    scene: Scene, state: State, bodies: Bodies, moved: Bodies, joint_force: Array | None, contact_force: Any
-) -> State:
+def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array]) -> State:
     """The new state with its flags."""
     moved = compute_once(moved, moved.position.x)
     position, orientation, velocity, angular_velocity = (
@@ -320,8 +338,6 @@ def _finish(
         "applied_torque": jnp.zeros_like(state.applied_torque),
         "flags": state.flags | broken.astype(state.flags.dtype),
     }
-    if joint_force is not None:
-        changes["joint_force"] = joint_force
-    if contact_force is not None:
-        changes["contact_force"], changes["contact_feature"] = contact_force
-    return dataclasses.replace(state, **changes)
+    if "flags" in forces:
+        forces = {**forces, "flags": changes["flags"] | forces["flags"].astype(state.flags.dtype)}
+    return dataclasses.replace(state, **{**changes, **forces})

@@ -28,14 +28,18 @@ class ContactSet(NamedTuple):
 def find_contacts(
     scene: Scene, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
 ) -> ContactSet:
-    """Runs the narrow phase (guide 11.1, phases 2 and 3).
+    """Runs the narrow phase for the pairs that have slots of their own (guide 11.1, phases 2 and 3).
 
     Args:
       scene: static structure.
       shapes: kind -> parameter -> (shape, ..., world).
       position, orientation: of all bodies, components (body, world).
     """
-    groups = [_group_contacts(scene, group, shapes, position, orientation) for group in scene.pair_groups]
+    return join_contacts([_group_contacts(scene, group, shapes, position, orientation) for group in scene.pair_groups])
+
+
+def join_contacts(groups: list[ContactSet]) -> ContactSet:
+    """The slots of all groups, one group after the other."""
     if len(groups) == 1:
         return groups[0]
     worlds = max(group.separation.shape[1] for group in groups)
@@ -57,10 +61,10 @@ def _group_contacts(
         shape_parameters(scene, shapes, group.kind_b, group.shapes_b),
         shape_poses(shapes, group.kind_b, group.shapes_b, group.bodies_b, position, orientation),
     )
-    return _flatten(manifold, len(group.bodies_a))
+    return flatten(manifold, len(group.bodies_a))
 
 
-def _flatten(manifold: Manifold, pair_count: int) -> ContactSet:
+def flatten(manifold: Manifold, pair_count: int) -> ContactSet:
     """Slots in the order pair, point."""
     points = manifold.points
     worlds = max(point.separation.shape[1] for point in points)

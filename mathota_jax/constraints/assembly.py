@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Inertia
-from mathota_jax.solver.table import EMPTY, Table
-from mathota_jax.spatial.indexing import take
+from mathota_jax.solver.pgs import Places
+from mathota_jax.solver.table import EMPTY, Table, TracedTable
+from mathota_jax.spatial.indexing import gather, take
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, dot
 
 
@@ -34,18 +37,32 @@ def inner(left: Side, right: Side) -> Array:
     return total if left.angular is None or right.angular is None else total + dot(left.angular, right.angular)
 
 
-def select(table: Table, tree: Any) -> Any:
+def select(table: Table | TracedTable, tree: Any) -> Any:
     """Slots of a table, in its order, from arrays with a leading slot axis. Padding repeats slot 0."""
     return take(tree, np.maximum(table.order, 0))
 
 
-def select_blocks(table: Table, side: int, tree: Any) -> Any:
+def select_blocks(table: Table | TracedTable, side: int, tree: Any, places: Places | None = None) -> Any:
     """Velocity blocks of one side of a table, in its order, from arrays with a leading block axis."""
+    if isinstance(table, TracedTable):
+        assert places is not None
+        return gather_columns(table, jnp.minimum(places.blocks[side], table.block_count - 1), tree)
     blocks = np.asarray(table.blocks[side], np.int32).reshape(-1)
     return take(tree, np.minimum(blocks, table.block_count - 1))
 
 
-def collect(tables: Sequence[Table], values: Sequence[Array], slot_count: int) -> Array:
+def gather_columns(table: TracedTable, index: Array, tree: Any) -> Any:
+    """Rows (turn * column, world) of arrays by an index (turn, constraint, world)."""
+    flat = index.reshape(-1, index.shape[-1])
+
+    def columns(values: Array) -> Array:
+        chosen = gather(values, flat)
+        return compute_once(jnp.repeat(chosen, table.together, axis=0), chosen)
+
+    return jax.tree.map(columns, tree)
+
+
+def collect(tables: Sequence[Table | TracedTable], values: Sequence[Array], slot_count: int) -> Array:
     """Slot order (slot, world) from the (turn, column, world) values of all tables."""
     slots = np.concatenate([table.order for table in tables])
     flat = jnp.concatenate([value.reshape(-1, value.shape[-1]) for value in values]) if len(values) > 1 else values[0]
@@ -54,15 +71,15 @@ def collect(tables: Sequence[Table], values: Sequence[Array], slot_count: int) -
     return take(flat.reshape(-1, flat.shape[-1]), positions)
 
 
-def pack_sides(table: Table, rows: Sequence[Side], worlds: int) -> Array:
+def pack_sides(table: Table | TracedTable, rows: Sequence[Side], worlds: int) -> Array:
     """(turn, row, component, column, world) from one `Side` for each row, components (turn * column, world)."""
     components = [tuple(row.linear) if row.angular is None else (*row.linear, *row.angular) for row in rows]
     return jnp.stack([pack_scalars(table, row, worlds) for row in components], axis=1)
 
 
-def pack_scalars(table: Table, values: Sequence[Array], worlds: int) -> Array:
+def pack_scalars(table: Table | TracedTable, values: Sequence[Array], worlds: int) -> Array:
     """(turn, row, column, world) from one (turn * column, world) array for each row; padding becomes 0."""
-    turns, columns = table.turn_count, len(table.slots[0])
+    turns, columns = table.turn_count, table.column_count
     full = [jnp.broadcast_to(value, (turns * columns, worlds)) for value in values]
     if EMPTY in table.order:
         full = [jnp.where(table.order[:, None] == EMPTY, 0.0, value) for value in full]

@@ -9,6 +9,7 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints.assembly import (
     Side,
     collect,
+    gather_columns,
     inner,
     pack_scalars,
     pack_sides,
@@ -31,8 +33,8 @@ from mathota_jax.constraints.assembly import (
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.pgs import Rows
-from mathota_jax.solver.table import Constraint, Table, make_tables
+from mathota_jax.solver.pgs import Places, Rows
+from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
@@ -70,6 +72,20 @@ class ContactRows(NamedTuple):
     slop: Array
 
 
+class PlacedPairs(NamedTuple):
+    """Pairs in the places of a traced table, components of shape (turn, constraint, world).
+
+    Attributes:
+      places: their velocity blocks.
+      bodies: bodies A and B; any body where the place is empty.
+      sign: of the row directions, where one side alone moves: + if that is B; None where both sides move.
+    """
+
+    places: Places
+    bodies: tuple[Array, Array]
+    sign: Array | None
+
+
 def contact_tables(scene: Scene) -> tuple[Table, ...]:
     """Order in which the solver visits the contact slots."""
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
@@ -84,12 +100,21 @@ def contact_tables(scene: Scene) -> tuple[Table, ...]:
 
 def couples_rotation(scene: Scene) -> bool:
     """Whether any row exerts a torque: not if the scene has only frictionless contacts between spheres and planes."""
-    kinds = {kind for group in scene.pair_groups for kind in (group.kind_a, group.kind_b)}
+    groups = (*scene.pair_groups, *scene.compact_groups)
+    kinds = {kind for group in groups for kind in (group.kind_a, group.kind_b)}
     return scene.friction or bool(scene.joints) or not kinds <= {"plane", "sphere"}
 
 
-def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet, motion: Motion) -> ContactRows:
-    """Rows of the contacts in one table."""
+def contact_rows(
+    scene: Scene,
+    table: Table | TracedTable,
+    model: Model,
+    contacts: ContactSet,
+    motion: Motion,
+    pairs: PlacedPairs | None = None,
+) -> ContactRows:
+    """Rows of the contacts in one table; `pairs` are those of a traced table."""
+    places = None if pairs is None else pairs.places
     chosen: ContactSet = select(table, contacts)
     worlds = max(
         chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1]
@@ -98,21 +123,21 @@ def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet,
     directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
     rotating = couples_rotation(scene)
     jacobians, responses, start, free = [], [], jnp.zeros(()), jnp.zeros(())
-    for side, sign in enumerate(_signs(scene, table)):
-        inertia = select_blocks(table, side, motion.inertia)
+    for side, sign in enumerate(_signs(scene, table, pairs)):
+        inertia = select_blocks(table, side, motion.inertia, places)
         # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
         surface = chosen.position + normal * (jnp.maximum(chosen.separation, 0.0) * (0.5 * sign))
-        arm = compute_once(surface - select_blocks(table, side, motion.position), chosen.separation)
+        arm = compute_once(surface - select_blocks(table, side, motion.position, places), chosen.separation)
         jacobian = [
             Side(direction * sign, compute_once(cross(arm, direction) * sign, arm.x) if rotating else None)
             for direction in directions
         ]
         jacobians.append(jacobian)
         responses.append([respond(row, inertia) for row in jacobian])
-        start = start + inner(jacobian[0], select_blocks(table, side, motion.velocity))
-        free = free + inner(jacobian[0], select_blocks(table, side, motion.free_velocity))
+        start = start + inner(jacobian[0], select_blocks(table, side, motion.velocity, places))
+        free = free + inner(jacobian[0], select_blocks(table, side, motion.free_velocity, places))
 
-    target, lever = _impact(scene, table, model, chosen, motion, start, free)
+    target, lever = _impact(scene, table, model, chosen, motion, start, free, pairs)
     active = chosen.active.astype(normal.x.dtype)
     normal_mass = active / _row_bound(table, jacobians, responses, active, (0,))
     bias = [-target]
@@ -122,7 +147,7 @@ def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet,
             tangent_mass=pack_scalars(
                 table, [active / _row_bound(table, jacobians, responses, active, (1, 2))], worlds
             )[:, 0],
-            friction=pack_scalars(table, [_pair_friction(scene, table, model)], worlds)[:, 0],
+            friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
@@ -133,8 +158,9 @@ def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet,
         bias=pack_scalars(table, bias, worlds),
         law=law,
         table=table,
+        places=places,
     )
-    slop = scene.options.slop * _smallest_size(scene, table, model)
+    slop = scene.options.slop * _smallest_size(scene, table, model, places)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     return ContactRows(
         rows,
@@ -146,7 +172,11 @@ def contact_rows(scene: Scene, table: Table, model: Model, contacts: ContactSet,
 
 
 def _row_bound(
-    table: Table, jacobians: list[list[Side]], responses: list[list[Side]], active: Array, rows: tuple[int, ...]
+    table: Table | TracedTable,
+    jacobians: list[list[Side]],
+    responses: list[list[Side]],
+    active: Array,
+    rows: tuple[int, ...],
 ) -> Array:
     """Bound of the response of each point to impulses on all points of its manifold, along the given rows.
 
@@ -210,7 +240,14 @@ def _push_only(effective_mass: Array) -> Bounded:
 
 
 def _impact(
-    scene: Scene, table: Table, model: Model, contacts: ContactSet, motion: Motion, start: Array, free: Array
+    scene: Scene,
+    table: Table | TracedTable,
+    model: Model,
+    contacts: ContactSet,
+    motion: Motion,
+    start: Array,
+    free: Array,
+    pairs: PlacedPairs | None,
 ) -> tuple[Array, Array]:
     """Normal velocity to reach at the end of the step, and the lever of the impulse.
 
@@ -230,12 +267,18 @@ def _impact(
     if not scene.restitution:
         return target, lever
     acceleration = (free - start) / dt
-    bounce_velocity, bounce_time, bounces = _bounce(scene, table, model, gap, start, acceleration)
+    bounce_velocity, bounce_time, bounces = _bounce(scene, table, model, gap, start, acceleration, pairs)
     return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
 
 
 def _bounce(
-    scene: Scene, table: Table, model: Model, gap: Array, start: Array, acceleration: Array
+    scene: Scene,
+    table: Table | TracedTable,
+    model: Model,
+    gap: Array,
+    start: Array,
+    acceleration: Array,
+    pairs: PlacedPairs | None,
 ) -> tuple[Array, Array, Array]:
     """End velocity, time of impact and whether the contact bounces, for constant acceleration within the step.
 
@@ -247,7 +290,7 @@ def _bounce(
     approach = safe_sqrt(jnp.maximum(discriminant, 0.0))  # speed at the impact
     divisor = approach - start
     time = safe_divide(2.0 * gap, divisor)
-    velocity = _pair_restitution(scene, table, model) * approach + acceleration * (dt - time)
+    velocity = _pair_restitution(scene, table, model, pairs) * approach + acceleration * (dt - time)
     reaches = (discriminant >= 0) & (divisor > 0) & (time <= dt) & ((start < 0) | (gap > 0))
     bounces = settle(jnp.where(reaches & (velocity > 0), 1.0, 0.0)) > 0
     return velocity, jnp.where(bounces, time, 0.0), bounces
@@ -258,8 +301,21 @@ def _slot_bodies(scene: Scene, table: Table) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.asarray(side, np.int32)[slots] for side in scene.slot_bodies)  # type: ignore[return-value]
 
 
-def _signs(scene: Scene, table: Table) -> list[np.ndarray | float]:
+def _of_bodies(scene: Scene, table: Table | TracedTable, pairs: PlacedPairs | None, values: Array) -> list[Array]:
+    """Values (body, world) of bodies A and B of each column."""
+    if isinstance(table, TracedTable):
+        assert pairs is not None
+        return [gather_columns(table, bodies, values) for bodies in pairs.bodies]
+    return [take(values, bodies) for bodies in _slot_bodies(scene, table)]
+
+
+def _signs(scene: Scene, table: Table | TracedTable, pairs: PlacedPairs | None) -> Sequence[np.ndarray | float | Array]:
     """Sign of the row directions on each side: + on body B, - on body A."""
+    if isinstance(table, TracedTable):
+        assert pairs is not None
+        if pairs.sign is None:
+            return [-1.0, 1.0]
+        return [jnp.repeat(pairs.sign.reshape(-1, pairs.sign.shape[-1]), table.together, axis=0)]
     if len(table.blocks) == 2:
         return [-1.0, 1.0]
     is_static = np.asarray(scene.static)
@@ -267,22 +323,23 @@ def _signs(scene: Scene, table: Table) -> list[np.ndarray | float]:
     return [float(signs[0])] if (signs == signs[0]).all() else [signs[:, None]]
 
 
-def _pair_friction(scene: Scene, table: Table, model: Model) -> Array:
+def _pair_friction(scene: Scene, table: Table | TracedTable, model: Model, pairs: PlacedPairs | None) -> Array:
     """Geometric mean (guide 8.4); derivative 0 where either coefficient is 0."""
-    a, b = _slot_bodies(scene, table)
-    return safe_sqrt(take(model.friction, a) * take(model.friction, b))
+    a, b = _of_bodies(scene, table, pairs, model.friction)
+    return safe_sqrt(a * b)
 
 
-def _pair_restitution(scene: Scene, table: Table, model: Model) -> Array:
+def _pair_restitution(scene: Scene, table: Table | TracedTable, model: Model, pairs: PlacedPairs | None) -> Array:
     """Smaller of the two coefficients (guide 8.2)."""
-    a, b = _slot_bodies(scene, table)
-    return jnp.minimum(take(model.restitution, a), take(model.restitution, b))
+    a, b = _of_bodies(scene, table, pairs, model.restitution)
+    return jnp.minimum(a, b)
 
 
-def _smallest_size(scene: Scene, table: Table, model: Model) -> Array:
+def _smallest_size(scene: Scene, table: Table | TracedTable, model: Model, places: Places | None) -> Array:
     sizes = take(model.size, scene.dynamic_bodies)
-    smallest = select_blocks(table, 0, sizes)
-    return smallest if len(table.blocks) == 1 else jnp.minimum(smallest, select_blocks(table, 1, sizes))
+    sides = len(places.blocks if isinstance(table, TracedTable) and places else table.blocks)  # type: ignore[union-attr]
+    smallest = select_blocks(table, 0, sizes, places)
+    return smallest if sides == 1 else jnp.minimum(smallest, select_blocks(table, 1, sizes, places))
 
 
 def position_rows(contact: ContactRows, displacement: Array, percent: float) -> Rows:
@@ -302,6 +359,7 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
         bias=jnp.where(error < 0, percent * error, error),
         law=_push_only(mass),
         table=rows.table,
+        places=rows.places,
     )
 
 
@@ -318,27 +376,43 @@ def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:
     return pack_scalars(table, impulses, contact.rows.bias.shape[-1])
 
 
-def matched_force(scene: Scene, contacts: ContactSet, force: Vec3, feature: Array) -> Vec3:
-    """Forces of the last step in the slots where their features are now; 0 for new features (guide 7.3)."""
+def matched_force(scene: Scene, contacts: ContactSet, force: Vec3, feature: Array) -> list[Vec3]:
+    """Forces of the last step in the slots where their features are now; 0 for new features (guide 7.3).
+
+    A vector for each group of pairs that have slots of their own.
+    """
     parts, slot = [], 0
     for group in scene.pair_groups:
         count = group.point_count
         rows = range(slot, slot + group.slot_count)
         old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
         shape = (len(group.bodies_a), count, -1)
-        same = old_feature.reshape(shape)[:, None, :, :] == new_feature.reshape(shape)[:, :, None, :]
-        same = same & active.reshape(shape)[:, :, None, :]
-
-        def move(component: Array, same: Array = same, shape: tuple = shape) -> Array:
-            old = component.reshape(shape)[:, None, :, :]
-            moved = jnp.where(same, old, 0.0)
-            total = moved[:, :, 0]
-            for point in range(1, moved.shape[2]):
-                total = total + moved[:, :, point]
-            return total.reshape(-1, total.shape[-1])
-
-        parts.append(old_force.map(move))
+        old_force = old_force.map(lambda x, shape=shape: x.reshape(shape))
+        parts.append(
+            matched_points(old_feature.reshape(shape), new_feature.reshape(shape), active.reshape(shape), old_force)
+        )
         slot += group.slot_count
+    return parts
+
+
+def matched_points(old_feature: Array, new_feature: Array, active: Array, force: Vec3) -> Vec3:
+    """Forces (pair * point, world) where the old feature of a point is the new one; arguments (pair, point, world)."""
+    same = old_feature[:, None, :, :] == new_feature[:, :, None, :]
+    same = same & active[:, :, None, :]
+
+    def move(component: Array) -> Array:
+        old = component[:, None, :, :]
+        moved = jnp.where(same, old, 0.0)
+        total = moved[:, :, 0]
+        for point in range(1, moved.shape[2]):
+            total = total + moved[:, :, point]
+        return total.reshape(-1, total.shape[-1])
+
+    return force.map(move)
+
+
+def join_forces(parts: list[Vec3]) -> Vec3:
+    """One vector in slot order."""
     if len(parts) == 1:
         return parts[0]
     return Vec3(*(jnp.concatenate(components) for components in zip(*parts, strict=True)))

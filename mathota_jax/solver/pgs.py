@@ -24,13 +24,27 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver.laws import Law
-from mathota_jax.solver.table import Table
+from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.settle import store
 from mathota_jax.struct import pytree, static
 
 UNROLLED_TURNS = 12
 """Largest number of turns that a sweep unrolls."""
+
+
+@pytree
+class Places:
+    """Where the constraints of a `TracedTable` act in this step.
+
+    Attributes:
+      blocks: for each side, (turn, constraint, world) velocity block; an empty place has block `block_count`, which does
+        not exist. No block occurs twice in a turn.
+      turns: () number of turns that hold a constraint in some world; they are the first ones.
+    """
+
+    blocks: tuple[Array, ...]
+    turns: Array
 
 
 @pytree
@@ -42,14 +56,16 @@ class Rows:
       response: for each side, ``M^-1 J^T``, same shape.
       bias: (turn, row, column, world) constraint error at zero velocity.
       law: coefficients with leading turn axis.
-      table: static order.
+      table: order of the sweep, a `Table` or a `TracedTable`.
+      places: what a traced table leaves open; None for a static one.
     """
 
     jacobian: tuple[Array, ...]
     response: tuple[Array, ...]
     bias: Array
     law: Law
-    table: Table = static()
+    table: Any = static()
+    places: Places | None = None
 
 
 Update = Callable[[Any, Array, Array], Array]
@@ -107,8 +123,10 @@ def _sweep(
     group: Rows, update: Update, coefficients: object, bias: Array, velocity: Array, impulse: Array
 ) -> tuple[Array, Array]:
     """One pass over the turns of a group."""
-    table = group.table
+    table: Table | TracedTable = group.table
     scanned = (group.jacobian, group.response, bias, coefficients, impulse)
+    if isinstance(table, TracedTable):
+        return _sweep_places(group, update, (group.jacobian, group.response, bias, coefficients), velocity, impulse)
     if table.turn_count <= UNROLLED_TURNS:
         new = []
         for turn in range(table.turn_count):
@@ -127,6 +145,22 @@ def _sweep(
     return lax.scan(body, velocity, (indices, jnp.asarray(table.receivers), scanned))
 
 
+def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, impulse: Array) -> tuple[Array, Array]:
+    """One pass over those turns of a traced table that hold a constraint."""
+    places = group.places
+    assert places is not None
+
+    def body(turn: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        velocity, impulse = carry
+        blocks, values = jax.tree.map(
+            lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), (places.blocks, (*scanned, impulse))
+        )
+        velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, values)
+        return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
+
+    return lax.fori_loop(0, places.turns, body, (velocity, impulse))
+
+
 def _turn(
     update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
 ) -> tuple[Array, Array]:
@@ -134,7 +168,7 @@ def _turn(
     jacobian, response, bias, coefficients, impulse = values
     error = bias
     for side_jacobian, side_blocks in zip(jacobian, blocks, strict=True):
-        error = error + _project(side_jacobian, _gather(velocity, side_blocks))
+        error = error + _project(side_jacobian, _gather(velocity, side_blocks, together))
     new = update(coefficients, impulse, error)
     # Stored, because every later row of the sweep depends on it: a chain of rows must not be computed again for each.
     new = store(new, response[0][:, 0])
@@ -156,8 +190,11 @@ def _respond(response: Array, impulse: Array, together: int) -> Array:
     return functools.reduce(jnp.add, unstack(total.reshape(total.shape[0], -1, together, total.shape[-1]), 2))
 
 
-def _gather(velocity: Array, blocks: Any) -> Array:
-    """Velocities (component, column, world) of the blocks of a turn; padding reads any block (its Jacobian is 0)."""
+def _gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
+    """Velocities (component, column, world) of the blocks of a turn; padding reads any block (it has no impulse)."""
+    if isinstance(blocks, jax.Array) and blocks.ndim == 2:
+        index = jnp.minimum(blocks, velocity.shape[1] - 1)[None]
+        return jnp.repeat(jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds"), together, axis=1)
     if isinstance(blocks, tuple):
         clipped = [min(block, velocity.shape[1] - 1) for block in blocks]
         return take(velocity, clipped, axis=1)
@@ -167,6 +204,12 @@ def _gather(velocity: Array, blocks: Any) -> Array:
 def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
     """Adds to each block the change by the constraint that acts on it."""
     block_count = velocity.shape[1]
+    if isinstance(receivers, tuple):
+        # In a turn of places no block occurs twice, so the order in which a scatter adds does not matter.
+        lanes = jnp.arange(velocity.shape[2])
+        for blocks, change in zip(receivers, changes, strict=True):
+            velocity = velocity.at[:, blocks, lanes].add(change, mode="drop")
+        return velocity
     if block_count == 1 and len(changes) == 1 and changes[0].shape[1] == 1:
         return velocity + changes[0]
     padding = jnp.zeros_like(changes[0][:, :1])
@@ -178,6 +221,10 @@ def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
 
 def row_velocity(group: Rows, velocity: Array) -> Array:
     """``J v`` of all rows of a group: (turn, row, column, world)."""
+    if group.places is not None:
+        together = group.table.together
+        gathered = [jax.vmap(lambda b: _gather(velocity, b, together))(blocks) for blocks in group.places.blocks]
+        return functools.reduce(jnp.add, [_project(j, v) for j, v in zip(group.jacobian, gathered, strict=True)])
     sides = zip(group.jacobian, group.table.blocks, strict=True)
     return functools.reduce(jnp.add, [_project(jacobian, _all_turns(velocity, blocks)) for jacobian, blocks in sides])
 
@@ -185,11 +232,14 @@ def row_velocity(group: Rows, velocity: Array) -> Array:
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
     for group, impulse in zip(rows, impulses, strict=True):
-        velocity = _add_responses(group.table, group.response, velocity, impulse)
+        velocity = _add_responses(group, group.response, velocity, impulse)
     return velocity
 
 
-def _add_responses(table: Table, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
+def _add_responses(group: Rows, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
+    table = group.table
+    if group.places is not None:
+        return _add_at_places(group.places, table.together, response, velocity, impulse)
     if table.turn_count <= UNROLLED_TURNS:
         by_turn = zip(*(unstack(side, 0) for side in response), unstack(impulse, 0), strict=True)
         for turn, (*sides, values) in enumerate(by_turn):
@@ -204,6 +254,16 @@ def _add_responses(table: Table, response: tuple[Array, ...], velocity: Array, i
     return lax.scan(body, velocity, (jnp.asarray(table.receivers), response, impulse))[0]
 
 
+def _add_at_places(
+    places: Places, together: int, response: tuple[Array, ...], velocity: Array, impulse: Array
+) -> Array:
+    def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
+        blocks, sides, values = at_turn
+        return _receive(velocity, blocks, [_respond(side, values, together) for side in sides]), None
+
+    return lax.scan(body, velocity, (places.blocks, response, impulse))[0]
+
+
 @solve.defjvp
 def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangents: tuple) -> tuple:
     rows, velocity, impulses = primals
@@ -212,7 +272,7 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        d_velocity = _add_responses(group.table, d_group.response, d_velocity, impulse)
+        d_velocity = _add_responses(group, d_group.response, d_velocity, impulse)
     jacobians, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
         error = group.bias + row_velocity(group, velocity)

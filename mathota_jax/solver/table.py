@@ -45,6 +45,11 @@ class Table:
         """Number of turns in one sweep."""
         return len(self.slots)
 
+    @property
+    def column_count(self) -> int:
+        """Columns of each turn."""
+        return len(self.slots[0])
+
     @functools.cached_property
     def order(self) -> np.ndarray:
         """(turn * column,) slots in the order of the table, EMPTY for padding."""
@@ -59,6 +64,35 @@ class Table:
             for turn, row in enumerate(blocks):
                 receivers[turn, list(row[:: self.together])] = side * constraints + np.arange(constraints)
         return receivers[:, : self.block_count]
+
+
+@dataclasses.dataclass(frozen=True)
+class TracedTable:
+    """Turns of a sweep whose constraints are known only in the step, in place of `Table`; `Rows.places` has the blocks.
+
+    Attributes:
+      turn_count: number of turns that there is room for.
+      constraint_count: number of constraints in a turn.
+      together: number of neighbouring columns that belong to one constraint.
+      first_slot: slots are numbered from here in the order turn, column.
+      block_count: number of velocity blocks.
+    """
+
+    turn_count: int
+    constraint_count: int
+    together: int
+    first_slot: int
+    block_count: int
+
+    @property
+    def column_count(self) -> int:
+        """Columns of each turn."""
+        return self.constraint_count * self.together
+
+    @property
+    def order(self) -> np.ndarray:
+        """(turn * column,) slots in the order of the table."""
+        return self.first_slot + np.arange(self.turn_count * self.column_count, dtype=np.int32)
 
 
 def make_tables(constraints: Sequence[Constraint], block_count: int, together: bool) -> tuple[Table, ...]:

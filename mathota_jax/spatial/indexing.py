@@ -1,4 +1,4 @@
-"""Selection of rows by indices known at trace time, by the cheapest operation that does it."""
+"""Selection of rows: by indices known at trace time, by the cheapest operation that does it, or by traced ones."""
 
 from __future__ import annotations
 
@@ -26,6 +26,26 @@ def take(tree: Any, indices: Sequence[int] | np.ndarray, axis: int = 0) -> Any:
             lambda x: x if stop - start == x.shape[axis] else jax.lax.slice_in_dim(x, start, stop, axis=axis), tree
         )
     return jax.tree.map(lambda x: jnp.take(x, index, axis=axis, unique_indices=False, mode="clip"), tree)
+
+
+def gather(values: Array, index: Array) -> Array:
+    """Rows of an array (row, ..., world) by traced indices (place, world) that may differ between worlds.
+
+    Indices must be in range. Either world axis may be 1. The result is (place, ..., world).
+    """
+    if values.ndim > 2:
+        index = index.reshape(index.shape[0], *(1,) * (values.ndim - 2), index.shape[1])
+        index = jnp.broadcast_to(index, (index.shape[0], *values.shape[1:-1], index.shape[-1]))
+        if index.shape[-1] != values.shape[-1]:
+            worlds = max(index.shape[-1], values.shape[-1])
+            index = jnp.broadcast_to(index, (*index.shape[:-1], worlds))
+            values = jnp.broadcast_to(values, (*values.shape[:-1], worlds))
+        return jnp.take_along_axis(values, index, axis=0, mode="promise_in_bounds")
+    if values.shape[-1] == 1:
+        return values[:, 0].at[index].get(mode="promise_in_bounds")
+    if index.shape[-1] == 1:
+        return values.at[index[:, 0]].get(mode="promise_in_bounds")
+    return jnp.take_along_axis(values, index, axis=0, mode="promise_in_bounds")
 
 
 def unstack(array: Array, axis: int) -> list[Array]:

@@ -1,0 +1,110 @@
+"""Which pairs get slots of their own and which are left to the broadphase; decided when a scene is built."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+from mathota_jax.collision.broadphase.choice import choose_method
+from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.geometry import SHAPES
+from mathota_jax.options import Options
+from mathota_jax.scene import Broadphase, CompactGroup, ShapeEntry, Tier
+
+OWN_SLOTS_UP_TO = 300
+"""Pairs that keep slots of their own; beyond, finding the close ones is cheaper than solving all."""
+
+UNPLANNED_KINDS = ("plane", "heightfield", "polyhedron")
+"""Kinds whose pairs always have slots: unbounded ones touch everything, faces of polyhedra are static."""
+
+PAIRS_PER_SHAPE = 8
+"""Close pairs for each moving shape: equal spheres have at most 6, boxes somewhat more, their bounds touch sooner."""
+
+FULL_TURNS = 12
+"""Turns of a sweep that hold as many pairs as can be without sharing a body; the later ones are narrower."""
+
+
+def plan_broadphase(
+    entries: Sequence[ShapeEntry],
+    static: Sequence[bool],
+    collides: Sequence[bool],
+    reach: Sequence[float],
+    excluded: Sequence[tuple[int, int]],
+    options: Options,
+) -> Broadphase | None:
+    """The broadphase of a scene, or None if each pair has its own slots.
+
+    Args:
+      entries: all shapes.
+      static, collides, reach: of each body: whether it never moves, whether it has contacts, its bounding radius [m].
+      excluded: pairs of bodies that never collide.
+      options: `broadphase` and `pair_capacity`.
+
+    Raises:
+      ValueError: kinds that can not collide with each other.
+    """
+    order = list(SHAPES)
+    taking_part = [k for k, entry in enumerate(entries) if collides[entry.body] and entry.kind not in UNPLANNED_KINDS]
+    shapes = sorted(taking_part, key=lambda k: (order.index(entries[k].kind), k))
+    moving = sum(not static[entries[k].body] for k in shapes)
+    fixed = len(shapes) - moving
+    pair_count = moving * (moving - 1) // 2 + moving * fixed
+    few = options.broadphase == "auto" and pair_count <= OWN_SLOTS_UP_TO
+    if options.broadphase == "none" or few or pair_count == 0:
+        return None
+    sizes = [reach[entries[k].body] for k in shapes]
+    method = choose_method(moving, fixed, sizes) if options.broadphase == "auto" else options.broadphase
+    groups = _groups([(entries[k].kind, static[entries[k].body]) for k in shapes], sizes)
+    capacity = options.pair_capacity or max(PAIRS_PER_SHAPE * moving, OWN_SLOTS_UP_TO)
+    capacity = min(capacity, pair_count)
+    return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups)
+
+
+def _groups(shapes: Sequence[tuple[str, bool]], sizes: Sequence[float]) -> tuple[CompactGroup, ...]:
+    """Groups by kinds and by the number of moving bodies, those with one first, as in `solver.table.make_tables`."""
+    kinds = list(dict.fromkeys(kind for kind, _ in shapes))
+    count = {key: sum(shape == key for shape in shapes) for key in set(shapes)}
+    groups = []
+    for side_count in (1, 2):
+        for a, b in itertools.combinations_with_replacement(kinds, 2):
+            moving_a, moving_b = count.get((a, False), 0), count.get((b, False), 0)
+            fixed_a, fixed_b = count.get((a, True), 0), count.get((b, True), 0)
+            if side_count == 2:
+                pairs = moving_a * (moving_a - 1) // 2 if a == b else moving_a * moving_b
+                widest = moving_a // 2 if a == b else min(moving_a, moving_b)
+                partners = max(moving_a, moving_b)
+            else:
+                pairs = moving_a * fixed_a if a == b else moving_a * fixed_b + moving_b * fixed_a
+                widest = moving_a if a == b else (moving_a if fixed_b else 0) + (moving_b if fixed_a else 0)
+                partners = max(fixed_a, fixed_b)
+            if pairs and (a, b) not in PAIRS:
+                raise ValueError(
+                    f"build: shapes of the kinds {a} and {b} can not collide with each other; pass collides=False for the "
+                    "bodies of one of them"
+                )
+            if pairs:
+                tiers = _tiers(widest, partners, side_count, sizes)
+                groups.append(CompactGroup(a, b, PAIRS[a, b].point_count, side_count, tiers))
+    return tuple(groups)
+
+
+def _tiers(widest: int, partners: int, side_count: int, sizes: Sequence[float]) -> tuple[Tier, ...]:
+    """Turns for a graph of contacts in which a body has a bounded number of neighbours.
+
+    A turn is a set of pairs without a common body, so it needs no more columns than half the bodies, or all of them where
+    the partners are static. A greedy colouring of a graph of greatest degree d takes few more than d turns, at most
+    2 d - 1; a body of size R has at most about 4 (1 + R / r)^2 neighbours of size r (area of the sphere of their centers).
+    """
+    packing = 4.0 * (1.0 + max(sizes) / min(sizes)) ** 2
+    degree = min(partners, math.ceil(packing))
+    turns = degree if side_count == 1 else min(2 * degree - 1, degree + 8)
+    tiers = [Tier(min(turns, FULL_TURNS), widest)]
+    turns -= tiers[0].turn_count
+    if turns > 0:
+        tiers.append(Tier(min(turns, FULL_TURNS), max(widest // 4, min(widest, 4))))
+        turns -= tiers[1].turn_count
+    large = sum(size > 2.0 * min(sizes) for size in sizes)
+    if turns > 0:
+        tiers.append(Tier(turns, max(1, min(large, widest // 4))))
+    return tuple(tiers)

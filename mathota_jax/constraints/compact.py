@@ -1,0 +1,290 @@
+"""Contacts of the pairs that the broadphase finds: places in the sweep of the solver, given anew in every step.
+
+Each pair gets a turn by colouring the graph of contacts (`solver.colouring`) and a column by counting. A place is known
+again in the next step by its pair, so that impulses carry over (guide 7.3).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.bodies import Bodies
+from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
+from mathota_jax.collision.broadphase import PairList, candidate_pairs
+from mathota_jax.collision.broadphase.ranges import lower_bound
+from mathota_jax.collision.compact import compact_contacts
+from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.constraints.contact import PlacedPairs, matched_points
+from mathota_jax.model import Model
+from mathota_jax.scene import CompactGroup, Scene
+from mathota_jax.solver.colouring import edge_colours
+from mathota_jax.solver.pgs import Places
+from mathota_jax.solver.table import TracedTable
+from mathota_jax.spatial.indexing import gather, take
+from mathota_jax.spatial.vector import Vec3, norm
+
+NO_PAIR = -1
+
+HASH = 0x9E3779B1 - (1 << 32)
+"""Odd, so that the product modulo 2^31 numbers different pairs differently (Knuth's multiplicative hash)."""
+
+
+class GroupPlaces(NamedTuple):
+    """What the places of one compact group hold, components of shape (place, world).
+
+    Attributes:
+      pair: shapes A and B; an admissible pair where the place is empty.
+      active: whether the place holds a pair.
+      listed: the pair's index in the list of the broadphase.
+      tables: order of the solver, a table for each tier.
+    """
+
+    pair: tuple[Array, Array]
+    active: Array
+    listed: Array
+    tables: list[tuple[TracedTable, PlacedPairs]]
+
+
+class ClosePairs(NamedTuple):
+    """Pairs close to each other in a step: the list, ascending by key, and their places, a `GroupPlaces` a group.
+
+    `overflow` is (world,) whether some pair found no place.
+    """
+
+    found: PairList
+    groups: list[GroupPlaces]
+    overflow: Array
+
+
+def close_pairs(model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None) -> ClosePairs:
+    """Runs the broadphase (guide 11.1, phase 2).
+
+    Args:
+      model: parameters and static scene.
+      bodies: all bodies.
+      free: velocities of the moving bodies at the end of the step if nothing constrained them, for contacts that will be
+        made within the step (guide 10.4); None for those at the present poses.
+    """
+    scene, plan = model.scene, model.scene.broadphase
+    assert plan is not None
+    displacements: tuple[Vec3, ...] = ()
+    turn = None
+    if free is not None:
+        linear, angular = (_of_all_bodies(scene, v) for v in free)
+        displacements = (bodies.velocity * model.dt, linear * model.dt)
+        if _turns_matter(scene, model):
+            turn = jnp.maximum(norm(bodies.angular_velocity), norm(angular)) * model.dt
+    bounds = swept_bounds(scene, model.shapes, bodies.position, bodies.orientation, displacements, turn)
+    found = candidate_pairs(plan.method, bounds, admissible_pairs(scene), plan.capacity)
+    groups, lost = _places(scene, found)
+    return ClosePairs(found, groups, found.overflow | lost)
+
+
+def _of_all_bodies(scene: Scene, blocks: Vec3) -> Vec3:
+    """Values of all bodies from those of the moving ones; 0 for the static ones."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    index = [block_of.get(body, len(block_of)) for body in range(scene.body_count)]
+    return take(blocks.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])), index)
+
+
+def _turns_matter(scene: Scene, model: Model) -> bool:
+    """Not for spheres about the centres of mass of their bodies."""
+    kinds = {kind for group in scene.compact_groups for kind in (group.kind_a, group.kind_b)}
+    return kinds != {"sphere"} or "local_position" in model.shapes["sphere"]
+
+
+def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:
+    """Runs the narrow phase for the close pairs, a set for each compact group."""
+    return [
+        compact_contacts(model.scene, group, model.shapes, bodies.position, bodies.orientation, p.pair, p.active)
+        for group, p in zip(model.scene.compact_groups, close.groups, strict=True)
+    ]
+
+
+def pair_keys(scene: Scene, close: ClosePairs) -> Array:
+    """(place, world) what `State.contact_pair` keeps."""
+    keys = [_key(scene, *p.pair) for p in close.groups]
+    return jnp.concatenate([jnp.where(p.active, key, NO_PAIR) for p, key in zip(close.groups, keys, strict=True)])
+
+
+def slot_bodies(scene: Scene, close: ClosePairs) -> tuple[Array, Array]:
+    """(slot, world) bodies A and B of the slots of the compact groups."""
+    body_of = jnp.asarray(admissible_pairs(scene).bodies, jnp.int32)
+    sides = []
+    for side in range(2):
+        parts = zip(scene.compact_groups, close.groups, strict=True)
+        sides.append(
+            jnp.concatenate([jnp.repeat(body_of[p.pair[side]], group.point_count, axis=0) for group, p in parts])
+        )
+    return tuple(sides)  # type: ignore[return-value]
+
+
+def matched_force(
+    scene: Scene, close: ClosePairs, contacts: ContactSet, force: Vec3, feature: Array, pair: Array
+) -> list[Vec3]:
+    """Forces of the last step in the slots where their pairs and features are now, a vector for each compact group.
+
+    Args:
+      scene, close, contacts: static structure, and what is close in this step; all slots.
+      force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
+    """
+    previous = _previous_places(scene, close.found, pair)
+    parts, slot, place = [], scene.static_slot_count, 0
+    for group, p in zip(scene.compact_groups, close.groups, strict=True):
+        rows = range(slot, slot + group.slot_count)
+        old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
+        source = gather(previous, p.listed) - place
+        known = p.active & (source >= 0) & (source < group.place_count)
+        source = jnp.clip(source, 0, group.place_count - 1)
+
+        def by_point(values: Array, count: int = group.point_count) -> Array:
+            return values.reshape(-1, count, values.shape[-1])
+
+        old_feature = jnp.where(known[:, None], gather(by_point(old_feature), source), NO_PAIR)
+        old_force = old_force.map(lambda x, f=by_point, s=source: gather(f(x), s))
+        parts.append(matched_points(old_feature, by_point(new_feature), by_point(active), old_force))
+        slot, place = slot + group.slot_count, place + group.place_count
+    return parts
+
+
+def _key(scene: Scene, first: Array, second: Array) -> Array:
+    assert scene.broadphase is not None
+    return first * len(scene.broadphase.shapes) + second
+
+
+def _previous_places(scene: Scene, found: PairList, pair: Array) -> Array:
+    """(listed pair, world) place that held the pair in the last step, -1 for none."""
+    keys = jnp.where(found.active, _key(scene, found.first, found.second), jnp.iinfo(jnp.int32).max)
+    count = keys.shape[0]
+    where = lower_bound(keys, pair)
+    same = (pair != NO_PAIR) & (where < count) & (gather(keys, jnp.minimum(where, count - 1)) == pair)
+    places = jnp.broadcast_to(jnp.arange(pair.shape[0], dtype=jnp.int32)[:, None], where.shape)
+    target = jnp.where(same, where, count)
+    worlds = where.shape[-1]
+    return jnp.full((count, worlds), NO_PAIR, jnp.int32).at[target, jnp.arange(worlds)].set(places, mode="drop")
+
+
+def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
+    """Gives every listed pair a turn and a column."""
+    admissible = admissible_pairs(scene)
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    block_count, capacity = len(block_of), found.first.shape[0]
+    blocks = np.asarray([block_of.get(body, block_count) for body in admissible.bodies], np.int32)
+    group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
+    active = found.active
+    ends = [jnp.asarray(blocks)[side] for side in (found.first, found.second)]
+    node_count = len(scene.compact_groups) * block_count
+    nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
+    turn_counts = [sum(tier.turn_count for tier in group.tiers) for group in scene.compact_groups]
+    turn_count = max(turn_counts)
+    priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
+    colour = edge_colours(nodes, priority, active, node_count, turn_count)  # type: ignore[arg-type]
+
+    # Sorted by group, turn and place in the list: the pairs of a turn follow one another.
+    code = jnp.where(active, group_of_pair * (turn_count + 1) + colour, len(turn_counts) * (turn_count + 1))
+    worlds = code.shape[-1]
+    sorted_pairs = jnp.sort(code * capacity + jnp.arange(capacity, dtype=jnp.int32)[:, None], axis=0) % capacity
+    counts = jnp.zeros((len(turn_counts) * (turn_count + 1), worlds), jnp.int32)
+    counts = counts.at[code, jnp.arange(worlds)].add(1, mode="drop")
+    starts = jnp.cumsum(counts, axis=0) - counts
+
+    groups, lost, slot = [], jnp.zeros(worlds, bool), scene.static_slot_count
+    for number, group in enumerate(scene.compact_groups):
+        turn = number * (turn_count + 1)
+        held, listed = [], []
+        tables, sizes = [], []
+        used = (counts[turn : turn + turn_counts[number]] > 0).any(1).sum(dtype=jnp.int32)
+        first_turn = 0
+        for tier in group.tiers:
+            rows = slice(turn + first_turn, turn + first_turn + tier.turn_count)
+            column = jnp.arange(tier.pair_count, dtype=jnp.int32)[None, :, None]
+            held.append((column < counts[rows][:, None]).reshape(-1, worlds))
+            position = jnp.minimum(starts[rows][:, None] + column, capacity - 1).reshape(-1, worlds)
+            listed.append(gather(sorted_pairs, position))
+            lost |= (counts[rows] > tier.pair_count).any(0)
+            tables.append(TracedTable(tier.turn_count, tier.pair_count, group.point_count, slot, block_count))
+            sizes.append(jnp.clip(used - first_turn, 0, tier.turn_count))
+            slot += tier.turn_count * tier.pair_count * group.point_count
+            first_turn += tier.turn_count
+        lost |= (counts[turn + turn_counts[number] : turn + turn_count + 1] > 0).any(0)
+        groups.append(_group_places(scene, group, found, jnp.concatenate(held), jnp.concatenate(listed), tables, sizes))
+    return groups, lost
+
+
+def _group_places(
+    scene: Scene,
+    group: CompactGroup,
+    found: PairList,
+    active: Array,
+    listed: Array,
+    tables: list[TracedTable],
+    used_turns: list[Array],
+) -> GroupPlaces:
+    admissible = admissible_pairs(scene)
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    block_count = len(block_of)
+    blocks = jnp.asarray([block_of.get(body, block_count) for body in admissible.bodies], jnp.int32)
+    bodies = jnp.asarray(admissible.bodies, jnp.int32)
+    example = _example(scene, group)
+    pair = tuple(
+        jnp.where(active, gather(side, listed), spare)
+        for side, spare in zip((found.first, found.second), example, strict=True)
+    )
+    block_a, block_b = (jnp.where(active, blocks[side], block_count) for side in pair)
+    sign = None
+    if group.side_count == 1:
+        b_moves = block_b < block_count
+        block_a = jnp.where(b_moves, block_b, block_a)
+        sign = jnp.where(b_moves, 1.0, -1.0)
+    sides = (block_a,) if group.side_count == 1 else (block_a, block_b)
+    start, placed = 0, []
+    for table, turns in zip(tables, used_turns, strict=True):
+        rows = range(start, start + table.turn_count * table.constraint_count)
+        start = rows.stop
+
+        def by_turn(values: Array, rows: range = rows, table: TracedTable = table) -> Array:
+            return take(values, rows).reshape(table.turn_count, table.constraint_count, -1)
+
+        placed.append(
+            (
+                table,
+                PlacedPairs(
+                    Places(tuple(by_turn(side) for side in sides), turns),
+                    (by_turn(bodies[pair[0]]), by_turn(bodies[pair[1]])),
+                    None if sign is None else by_turn(sign),
+                ),
+            )
+        )
+    return GroupPlaces(pair, active, listed, placed)  # type: ignore[arg-type]
+
+
+def _moving_shapes(scene: Scene) -> np.ndarray:
+    return ~np.asarray(admissible_pairs(scene).static)
+
+
+def _group_codes(scene: Scene) -> Array:
+    """(shape, shape) group of each pair of shapes; 0 for pairs that are never listed."""
+    assert scene.broadphase is not None
+    kinds = [scene.shapes[entry].kind for entry in scene.broadphase.shapes]
+    names = list(dict.fromkeys(kinds))
+    kind, moving = np.asarray([names.index(k) for k in kinds]), _moving_shapes(scene).astype(int)
+    codes = np.zeros((len(names), len(names), 3), np.int32)
+    for number, group in enumerate(scene.compact_groups):
+        codes[names.index(group.kind_a), names.index(group.kind_b), group.side_count] = number
+    return jnp.asarray(codes[kind[:, None], kind[None, :], moving[:, None] + moving[None, :]])
+
+
+def _example(scene: Scene, group: CompactGroup) -> tuple[int, int]:
+    """An admissible pair of the group, for empty places: its values are finite, and not used."""
+    assert scene.broadphase is not None
+    kinds = np.asarray([scene.shapes[entry].kind for entry in scene.broadphase.shapes])
+    moving = _moving_shapes(scene)
+    a, b = np.flatnonzero(kinds == group.kind_a), np.flatnonzero(kinds == group.kind_b)
+    fits = (moving[a][:, None].astype(int) + moving[b][None, :]) == group.side_count
+    fits &= a[:, None] < b[None, :]
+    row, column = np.unravel_index(np.argmax(fits), fits.shape)
+    return int(a[row]), int(b[column])
