@@ -39,12 +39,14 @@ class Distance(NamedTuple):
       separation: () signed gap [m], negative when overlapping: then the least translation that parts the shapes.
       normal: (3,) unit vector from A to B, world frame; the derivative of the separation by the position of B.
       point_a, point_b: (3,) points of the surfaces [m], world frame; ``point_b - point_a = separation * normal``.
+      converged: () False where an iterative search ended at its limit: the rest is then the best bound found.
     """
 
     separation: Array
     normal: Array
     point_a: Array
     point_b: Array
+    converged: Array
 
 
 class ContactManifold(NamedTuple):
@@ -226,6 +228,7 @@ class _Nearest(NamedTuple):
     normal: Vec3
     point_a: Vec3
     point_b: Vec3
+    converged: Array
 
 
 def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> _Nearest:
@@ -237,7 +240,8 @@ def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> _Nearest:
         nearer = settle(jnp.where(point.active & (point.separation < separation), 1.0, 0.0)) > 0.5
         position, separation = where(nearer, point.position, position), jnp.where(nearer, point.separation, separation)
     half = found.normal * (0.5 * separation)
-    return _Nearest(separation, found.normal, position - half, position + half)
+    converged = jnp.ones(jnp.shape(separation), bool) if found.converged is None else found.converged
+    return _Nearest(separation, found.normal, position - half, position + half, converged)
 
 
 def _natural(nearest: _Nearest) -> Distance:
@@ -247,7 +251,8 @@ def _natural(nearest: _Nearest) -> Distance:
         return jnp.stack([jnp.broadcast_to(component, worlds)[0] for component in v])
 
     separation = jnp.broadcast_to(nearest.separation, worlds)[0]
-    return Distance(separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b))
+    converged = jnp.broadcast_to(nearest.converged, worlds)[0]
+    return Distance(separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b), converged)
 
 
 @batch_last

@@ -21,6 +21,9 @@ class Flag(enum.IntFlag):
     """More pairs were close to each other than `Options.pair_capacity`, or than fit around one body; the deepest were kept
     as far as there was room, the others passed through each other in this step."""
 
+    NOT_CONVERGED = 4
+    """The search for the closest points of two shapes ended at its limit; the best bound that it found was used."""
+
 
 @pytree
 class State:

@@ -314,10 +314,22 @@ def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> dic
         impulses = impulses[count:]
         changes["contact_force"] = contact.slot_force(problem.contact_rows, list(impulses), scene.slot_count, model.dt)
         changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
+        if problem.contacts.converged is not None or problem.close is not None:
+            changes["flags"] = _collision_flags(problem.contacts, problem.close)
         if problem.close is not None:
             changes["contact_pair"] = compact.pair_keys(scene, problem.close)
-            changes["flags"] = jnp.where(problem.close.overflow, int(Flag.CONTACT_OVERFLOW), 0)
     return changes
+
+
+def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> Array:
+    """Bits (world,) for what the collision phases could not do."""
+    flags = jnp.zeros(contacts.separation.shape[-1:], jnp.int32)
+    if contacts.converged is not None:
+        failed = (contacts.active & ~contacts.converged).any(0)
+        flags = flags | jnp.where(failed, int(Flag.NOT_CONVERGED), 0)
+    if close is not None:
+        flags = flags | jnp.where(close.overflow, int(Flag.CONTACT_OVERFLOW), 0)
+    return flags
 
 
 def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array]) -> State:

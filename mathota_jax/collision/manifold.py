@@ -26,7 +26,12 @@ class ContactPoint(NamedTuple):
 
 
 class Manifold(NamedTuple):
-    """Contact points of a pair that share one unit `normal` from A to B, in the world frame."""
+    """Contact points of a pair that share one unit `normal` from A to B, in the world frame.
+
+    `converged` is bool, shape ``(pair, world)``, False where an iterative search ended at its limit with the best bound
+    found; None for methods that always end.
+    """
 
     normal: Vec3
     points: tuple[ContactPoint, ...]
+    converged: Array | None = None

@@ -16,13 +16,17 @@ from mathota_jax.spatial.vector import Vec3
 
 
 class ContactSet(NamedTuple):
-    """All contact slots of a scene, components of shape (slot, world); slots are numbered group, pair, point."""
+    """All contact slots of a scene, components of shape (slot, world); slots are numbered group, pair, point.
+
+    `converged` is None if no pair of the scene needs an iterative search.
+    """
 
     position: Vec3
     normal: Vec3
     separation: Array
     feature: Array
     active: Array
+    converged: Array | None
 
 
 def find_contacts(
@@ -43,10 +47,14 @@ def join_contacts(groups: list[ContactSet]) -> ContactSet:
     if len(groups) == 1:
         return groups[0]
     worlds = max(group.separation.shape[1] for group in groups)
+    if any(group.converged is not None for group in groups):
+        groups = [g if g.converged is not None else g._replace(converged=jnp.ones_like(g.active)) for g in groups]
     return ContactSet(*(_concatenate(list(fields), worlds) for fields in zip(*groups, strict=True)))  # type: ignore[arg-type]
 
 
 def _concatenate(values: list[Any], worlds: int) -> Any:
+    if values[0] is None:
+        return None
     if isinstance(values[0], Vec3):
         return Vec3(*(_concatenate(list(components), worlds) for components in zip(*values, strict=True)))
     return jnp.concatenate([jnp.broadcast_to(value, (value.shape[0], worlds)) for value in values])
@@ -88,4 +96,5 @@ def flatten(manifold: Manifold, pair_count: int) -> ContactSet:
         per_point([point.separation for point in points]),
         per_point([point.feature for point in points]),
         per_point([point.active for point in points]),
+        None if manifold.converged is None else per_pair(manifold.converged),
     )

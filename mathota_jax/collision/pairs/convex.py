@@ -20,10 +20,12 @@ def convex_pair(kind_a: str, kind_b: str) -> Callable[[dict[str, Any], Pose, dic
     def pair(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
         contact = convex_distance(kind_a, a, pose_a, kind_b, b, pose_b)
         if kind_a in FACES and kind_b in FACES:
-            return face_manifold(kind_a, a, pose_a, kind_b, b, pose_b, contact)
+            found = face_manifold(kind_a, a, pose_a, kind_b, b, pose_b, contact)
+            return found._replace(converged=contact.converged)
         middle = (contact.point_a + contact.point_b) * 0.5
         always = jnp.ones(jnp.shape(contact.separation), bool)
-        return Manifold(contact.normal, (ContactPoint(middle, contact.separation, contact.feature, always),))
+        point = ContactPoint(middle, contact.separation, contact.feature, always)
+        return Manifold(contact.normal, (point,), contact.converged)
 
     pair.__name__ = f"{kind_a}_{kind_b}"
     return pair
