@@ -22,7 +22,7 @@ from mathota_jax.bodies import (
     vector,
 )
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
-from mathota_jax.constraints import compact, contact, joint
+from mathota_jax.constraints import compact, contact, joint, warm_start
 from mathota_jax.constraints.assembly import Side, collect
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
@@ -220,12 +220,12 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
     ]
     if problem.contacts is not None:
         old, feature = vector(state.contact_force), state.contact_feature
-        parts = contact.matched_force(model.scene, problem.contacts, old, feature)
+        parts = warm_start.matched_force(model.scene, problem.contacts, old, feature)
         if problem.close is not None and state.contact_pair is not None:
             parts += compact.matched_force(
                 model.scene, problem.close, problem.contacts, old, feature, state.contact_pair
             )
-        force = compute_once(contact.join_forces(parts), state.position)
+        force = compute_once(warm_start.join_forces(parts), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
     return tuple(start)
 

@@ -18,7 +18,8 @@ from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.broadphase.ranges import lower_bound
 from mathota_jax.collision.compact import compact_contacts
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints.contact import PlacedPairs, matched_points
+from mathota_jax.constraints.contact import PlacedPairs
+from mathota_jax.constraints.warm_start import matched_points
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours

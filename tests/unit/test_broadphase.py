@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, candidate_pairs
+from mathota_jax.collision.broadphase.choice import choose_method
 from mathota_jax.spatial.vector import Vec3
 
 WORLDS = 3
@@ -238,3 +239,11 @@ def test_selection_has_no_derivative_and_does_not_break_one(method, float64):
 def test_too_many_shapes_are_refused():
     with pytest.raises(ValueError, match="46340"):
         everything(50_000)
+
+
+def test_method_follows_from_the_size_of_the_scene():
+    mixed = [0.1] * 9 + [5.0]
+    assert choose_method(64, 0, [0.1]) == "all_pairs"
+    assert choose_method(1024, 0, [0.1, 0.2]) == "grid"
+    assert choose_method(1024, 0, mixed) == "sort_and_sweep"
+    assert choose_method(100, 2000, mixed) == "bvh"

@@ -16,6 +16,8 @@ DEFAULTS = {
     "position_percent": 0.8,
     "baumgarte": 0.1,
     "warm_start": True,
+    "broadphase": "auto",
+    "pair_capacity": None,
 }
 OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}
 
@@ -36,3 +38,9 @@ def test_options_are_frozen_hashable_and_comparable():
     assert hash(Options()) == hash(Options())
     with pytest.raises(dataclasses.FrozenInstanceError):
         Options().dt = 0.1
+
+
+@pytest.mark.parametrize(("name", "value"), [("broadphase", "octree"), ("broadphase", None), ("pair_capacity", 0)])
+def test_bad_broadphase_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"Options.{name}"):
+        Options(**{name: value})
