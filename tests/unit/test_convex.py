@@ -19,16 +19,15 @@ from mathota_jax.spatial.vector import Vec3
 KINDS = ("sphere", "capsule", "box", "cylinder", "cone", "polyhedron")
 ROUND, FLAT = ("sphere", "capsule"), ("box", "polyhedron")
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
-QUICK = [("box", "polyhedron"), ("cylinder", "cone"), ("capsule", "polyhedron"), ("box", "cylinder"), ("sphere", "cone")]
+QUICK = [("box", "polyhedron"), ("cylinder", "cone")]
+"""Pairs of the normal suite; the slow one runs them all."""
 VERTICES = 12
-NORMAL_COUNT, SLOW_COUNT = 64, 952
+NORMAL_COUNT, SLOW_COUNT = 40, 952
 """Poses of one class: the slow sweep has 21 classes x 952 poses, 20,000 in all, in each precision."""
 
 
-def marked(pairs):
-    return [
-        pytest.param(pair, id="_".join(pair), marks=() if pair in QUICK else pytest.mark.slow) for pair in pairs
-    ]
+def every_pair(*quick):
+    return [pytest.param(pair, id="_".join(pair), marks=() if pair in quick else pytest.mark.slow) for pair in PAIRS]
 
 
 @pytest.fixture(params=["float32", "float64"])
@@ -45,7 +44,9 @@ def random_shape(kind, rng, count):
         return {"half_extents": rng.uniform(0.2, 1.0, (count, 3))}
     if kind == "polyhedron":
         points = rng.normal(size=(count, VERTICES, 3))
-        return {"vertices": points / np.linalg.norm(points, axis=2, keepdims=True) * rng.uniform(0.3, 1.0, (count, 1, 3))}
+        return {
+            "vertices": points / np.linalg.norm(points, axis=2, keepdims=True) * rng.uniform(0.3, 1.0, (count, 1, 3))
+        }
     names = ("radius",) if kind == "sphere" else ("radius", "half_height")
     return {name: rng.uniform(0.2, 1.0, count) for name in names}
 
@@ -70,7 +71,10 @@ def random_scene(pair, count, forms=("", ""), reach=2.0):
     rng = np.random.default_rng(zlib.crc32("_".join((*pair, *forms)).encode()))
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    scene = {side: stretched(random_shape(kind, rng, count), kind, f) for side, kind, f in zip("ab", pair, forms, strict=True)}
+    scene = {
+        side: stretched(random_shape(kind, rng, count), kind, f)
+        for side, kind, f in zip("ab", pair, forms, strict=True)
+    }
     scene["pa"] = rng.normal(size=(count, 3)) * 0.1
     scene["pb"] = scene["pa"] + direction * rng.uniform(0.0, reach, (count, 1))
     for side in "ab":
@@ -85,7 +89,12 @@ def rounded(scene, dtype):
 
 def to_engine(scene, dtype):
     def vector(rows):
-        return Vec3(*(jnp.asarray(rows[..., k].T[..., None, :] if rows.ndim == 3 else rows[None, :, k], dtype) for k in range(3)))
+        return Vec3(
+            *(
+                jnp.asarray(rows[..., k].T[..., None, :] if rows.ndim == 3 else rows[None, :, k], dtype)
+                for k in range(3)
+            )
+        )
 
     def shape(parameters):
         return {n: vector(v) if v.ndim > 1 else jnp.asarray(v[None], dtype) for n, v in parameters.items()}
@@ -176,21 +185,37 @@ class Placed:
         """Separation along a unit normal: a lower bound of the signed distance, attained by the true normal."""
         return normal @ self.least(normal) - sum(self.radii)
 
+    def seeds(self):
+        """Points of B - A to start from: all differences of vertices of polytopes, else some support points."""
+        corners = []
+        for kind, shape, position, rotation in self.sides:
+            if kind not in (*FLAT, *ROUND):
+                return [self.least(d) for d in np.random.default_rng(1).normal(size=(64, 3))]
+            local = {
+                "sphere": lambda: np.zeros((1, 3)),
+                "capsule": lambda: np.array([[0, 1, 0], [0, -1, 0]]) * shape["half_height"],  # noqa: B023
+                "box": lambda: np.array(list(itertools.product((-1, 1), repeat=3))) * shape["half_extents"],  # noqa: B023
+                "polyhedron": lambda: shape["vertices"],  # noqa: B023
+            }[kind]()
+            corners.append(position + local @ rotation.T)
+        return list((corners[1][:, None] - corners[0][None]).reshape(-1, 3))
+
     def size(self):
         directions = np.random.default_rng(0).normal(size=(50, 3))
         extents = [
-            max(np.linalg.norm(self.extreme(s, d) - self.sides[s][2]) for d in directions) + self.radii[s] for s in (0, 1)
+            max(np.linalg.norm(self.extreme(s, d) - self.sides[s][2]) for d in directions) + self.radii[s]
+            for s in (0, 1)
         ]
         return max(extents)
 
 
-def oracle(placed, tolerance=1e-11):
+def oracle(placed, tolerance=1e-10):
     """Signed distance and normal: cutting planes until the bounds meet (hull of support points against its support).
 
     Apart: the nearest point of the hull by non-negative least squares. Overlapping: the nearest facet by Qhull, which is
     the global minimum of the depth since every facet of the true difference lies outside the hull found so far.
     """
-    points = [placed.least(d) for d in np.random.default_rng(1).normal(size=(64, 3))]
+    points = placed.seeds()
     for _ in range(500):
         rows = np.array(points)
         weights, _ = nnls(np.vstack([rows.T, np.ones(len(rows))]), np.array([0, 0, 0, 1.0]), maxiter=100000)
@@ -204,7 +229,7 @@ def oracle(placed, tolerance=1e-11):
             return placed.reach(normal), normal
         points.append(point)
     hull = ConvexHull(np.array(points), incremental=True)
-    for _ in range(2000):
+    for _ in range(400):
         facet = np.argmax(hull.equations[:, 3])
         normal = -hull.equations[facet, :3]
         point = placed.least(normal)
@@ -253,7 +278,9 @@ def check(pair, scene, dtype):
         # Inside the valid cone of normals: the separation along ours is the distance to the gate's precision.
         angle = np.degrees(np.arccos(np.clip(result.normal[index] @ normal, -1, 1)))
         valid = angle < 0.1 or abs(placed.reach(result.normal[index]) - truth) < share * size
-        witness = np.abs(result.point_b[index] - result.point_a[index] - result.separation[index] * result.normal[index])
+        witness = np.abs(
+            result.point_b[index] - result.point_a[index] - result.separation[index] * result.normal[index]
+        )
         on_surface = max(abs(distance_to(placed, s, p[index])) for s, p in enumerate((result.point_a, result.point_b)))
         if abs(error) > share * size or not valid or witness.max() > tight * size or on_surface > 2 * tight * size:
             failures.append((index, truth, error, angle, witness.max(), on_surface, bool(result.converged[index])))
@@ -261,7 +288,7 @@ def check(pair, scene, dtype):
     return result
 
 
-@pytest.mark.parametrize("pair", marked(PAIRS))
+@pytest.mark.parametrize("pair", every_pair(*QUICK))
 def test_random_poses(pair, precision):
     result = check(pair, random_scene(pair, NORMAL_COUNT), precision)
     assert 0.1 < (result.separation < 0).mean() < 0.99  # both regimes are there
@@ -269,13 +296,13 @@ def test_random_poses(pair, precision):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", PAIRS, ids="_".join)
+@pytest.mark.parametrize("pair", PAIRS, ids=["_".join(pair) for pair in PAIRS])
 def test_many_random_poses(pair, precision):
     check(pair, random_scene(pair, SLOW_COUNT, ("", "")), precision)
 
 
 @pytest.mark.parametrize("gap", [1e-2, 1e-4, -1e-4, -1e-2])
-@pytest.mark.parametrize("pair", marked(PAIRS))
+@pytest.mark.parametrize("pair", every_pair(*QUICK))
 def test_touching_and_shallow_poses(pair, gap, precision):
     scene = random_scene(pair, NORMAL_COUNT)
     for index in range(NORMAL_COUNT):
@@ -285,13 +312,15 @@ def test_touching_and_shallow_poses(pair, gap, precision):
     assert np.all((result.separation < 0) == (gap < 0))
 
 
-@pytest.mark.parametrize("forms", [("needle", "plate"), ("plate", "plate"), ("needle", "needle"), ("small", ""), ("", "small")])
-@pytest.mark.parametrize("pair", marked(PAIRS))
+@pytest.mark.parametrize(
+    "forms", [("needle", "plate"), ("plate", "plate"), ("needle", "needle"), ("small", ""), ("", "small")]
+)
+@pytest.mark.parametrize("pair", every_pair(*QUICK))
 def test_extreme_forms(pair, forms, precision):
     check(pair, random_scene(pair, NORMAL_COUNT, forms, reach=1.0), precision)
 
 
-@pytest.mark.parametrize("pair", marked(PAIRS))
+@pytest.mark.parametrize("pair", every_pair(*QUICK))
 def test_nearly_coincident_centres(pair, precision):
     scene = random_scene(pair, NORMAL_COUNT)
     scene["pb"] = scene["pa"] + 1e-6 * (scene["pb"] - scene["pa"])
@@ -303,7 +332,14 @@ def test_support_points_are_extreme(kind):
     with jax.enable_x64(True):
         rng = np.random.default_rng(3)
         shape, directions = random_shape(kind, rng, 200), rng.normal(size=(200, 3))
-        scene = {"a": shape, "b": shape, "pa": directions, "pb": directions, "qa": np.eye(4)[[0] * 200], "qb": np.eye(4)[[0] * 200]}
+        scene = {
+            "a": shape,
+            "b": shape,
+            "pa": directions,
+            "pb": directions,
+            "qa": np.eye(4)[[0] * 200],
+            "qb": np.eye(4)[[0] * 200],
+        }
         parameters, direction, *_ = to_engine(scene, np.float64)
         point, code = support(kind, parameters, direction)
         assert code.dtype == jnp.int32
@@ -319,7 +355,17 @@ def test_support_points_are_extreme(kind):
 def degenerate_scene(pair):
     turns = [Rotation.identity()]
     turns += [Rotation.from_rotvec(t * np.eye(3)[k]) for t in (1e-12, 1e-6, 1e-3, np.pi / 4, np.pi / 2) for k in (0, 2)]
-    offsets = [(0, 0, 0), (1e-9, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 1, 1), (0, 0.95, 0), (0.5, 0, 0), (0, 2, 0)]
+    offsets = [
+        (0, 0, 0),
+        (1e-9, 0, 0),
+        (1, 0, 0),
+        (0, 1, 0),
+        (1, 1, 0),
+        (1, 1, 1),
+        (0, 0.95, 0),
+        (0.5, 0, 0),
+        (0, 2, 0),
+    ]
     table = list(itertools.product(offsets, turns))
     count = len(table)
     cube = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
@@ -335,7 +381,7 @@ def degenerate_scene(pair):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("pair", marked(PAIRS))
+@pytest.mark.parametrize("pair", every_pair(("box", "cylinder")))
 def test_degenerate_poses(pair, precision):
     """Coincident centres, parallel axes, exact touch of faces, edges and corners, tilts to nothing: right and finite."""
     scene = rounded(degenerate_scene(pair), precision)
@@ -343,13 +389,15 @@ def test_degenerate_poses(pair, precision):
     share = 2e-5 if precision == np.float32 else 1e-6
     for index in range(len(scene["pb"])):
         placed = Placed(pair, scene, index)
-        truth, _ = oracle(placed)
+        truth, _ = oracle(placed, 1e-7)
         assert abs(result.separation[index] - truth) < share, index
         assert abs(placed.reach(result.normal[index]) - truth) < share, index
 
     def everything(*arguments):
         contact = call(pair, *arguments)
-        return sum(jnp.sum(x) for x in jax.tree.leaves((contact.normal, contact.separation, contact.point_a, contact.point_b)))
+        return sum(
+            jnp.sum(x) for x in jax.tree.leaves((contact.normal, contact.separation, contact.point_a, contact.point_b))
+        )
 
     arguments = to_engine(scene, precision)
     gradient = jax.grad(everything, argnums=tuple(range(6)))
@@ -361,7 +409,7 @@ def test_degenerate_poses(pair, precision):
 # ---- derivatives -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("pair", marked(PAIRS))
+@pytest.mark.parametrize("pair", every_pair(("cylinder", "polyhedron")))
 def test_derivatives_against_central_differences(pair):
     """Separation, normal and both points by every parameter and pose component, away from changes of feature."""
     with jax.enable_x64(True):
