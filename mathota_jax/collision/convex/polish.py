@@ -103,7 +103,8 @@ def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
         consistent = model - reach <= 4.0 * rounding
         code = (reach > state.best).astype(reach.dtype) + 2.0 * (reach > state.best - rounding) + 4.0 * consistent
         code = settle_code(jnp.where(state.done, 0.0, code))
-        better = (code & 1 == 1) | ((code >= 6) & ~state.exact)
+        # Near the solution the separation is flat: the latest consistent normal is the best, to more than half the digits.
+        better = (code >= 6) | ((code & 1 == 1) & ~state.exact)
         exact = (code & 4) == 4
         here = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
