@@ -93,16 +93,17 @@ def _rotation(pose: Pose) -> Mat3:
 Weights = tuple[Array, Array, Array]
 
 
-def barycentric(first: Vec3, second: Vec3, third: Vec3, two: Array, three: Array) -> Weights:
+def barycentric(points: Sequence[Vec3], two: Array, three: Array) -> Weights:
     """Weights of the point closest to the origin on the plane of three points; on the line of two; of the first alone.
 
     Differentiable. Degenerate triangles and segments weigh their first point.
 
     Args:
-        first: First point; likewise `second`, `third`.
+        points: Three points.
         two: bool, use the second point.
         three: bool, use the third point too.
     """
+    first, second, third = points
     edge, other = second - first, third - first
     normal = cross(edge, other)
     inverse = safe_divide(jnp.ones_like(first.x), dot(normal, normal))

@@ -181,6 +181,7 @@ def _least(corners: tuple, points: tuple) -> tuple[Array, Array]:
             better = bound < best
             best, code = jnp.where(better, bound, best), jnp.where(better, float(side), code)
     assert best is not None
+    assert code is not None
     eps = float(jnp.finfo(best.dtype).eps)
     edge, other = points[1] - points[0], points[2] - points[0]
     normal = cross(edge, other)

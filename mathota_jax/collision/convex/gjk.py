@@ -40,7 +40,7 @@ class Simplex(NamedTuple):
     """
 
     direction: Vec3
-    pieces: tuple[Array, Array, Array]
+    pieces: tuple[Array, ...]
     point_a: Vec3
     point_b: Vec3
     overlap: Array
@@ -51,9 +51,9 @@ class _State(NamedTuple):
     turn: Array
     closest: Vec3
     squared: Array
-    points: tuple[Vec3, Vec3, Vec3]
-    points_a: tuple[Vec3, Vec3, Vec3]
-    pieces: tuple[Array, Array, Array]
+    points: tuple[Vec3, ...]
+    points_a: tuple[Vec3, ...]
+    pieces: tuple[Array, ...]
     count: Array
     overlap: Array
     done: Array
@@ -117,7 +117,7 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
         jnp.where(state.count > 2, state.pieces[2], state.pieces[0]),
     )
     two, three = state.count > 1, state.count > 2
-    weights = barycentric(*state.points, two, three)
+    weights = barycentric(state.points, two, three)
     point_a = combine(weights, state.points_a)
     point_b = point_a + combine(weights, state.points) - shift
     return Simplex(unit(state.closest, first), pieces, point_a, point_b, state.overlap, state.done)
@@ -158,7 +158,7 @@ def _choose(state: _State, point: Vec3, stop: Array) -> Array:
 
 def _apply(
     state: _State, point: Vec3, point_a: Vec3, pieces: Array, choice: Array
-) -> tuple[Vec3, tuple[Vec3, Vec3, Vec3], tuple[Vec3, Vec3, Vec3], tuple[Array, Array, Array], Array]:
+) -> tuple[Vec3, tuple[Vec3, ...], tuple[Vec3, ...], tuple[Array, ...], Array]:
     """Closest point and simplex of a choice: the newest point in slot 0, its companions after it."""
     keep = choice >= INSIDE
     on_edge, on_triangle = (choice >= EDGE) & (choice < TRIANGLE), (choice >= TRIANGLE) & (choice < INSIDE)

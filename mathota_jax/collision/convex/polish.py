@@ -39,7 +39,7 @@ STIFFNESS_ROUNDING = 64.0
 class Ties(NamedTuple):
     """Distinct piece pairs that are extreme at once: the first always, the others where `two`, `three`."""
 
-    pieces: tuple[Array, Array, Array]
+    pieces: tuple[Array, ...]
     two: Array
     three: Array
 
@@ -75,7 +75,7 @@ def polish(shapes: Difference, simplex: Simplex) -> Closest:
     stepped = _step(shapes, ties, start)
     normal = start + where(found.exact, stepped - lax.stop_gradient(stepped), start - start)
     points = [shapes.points(pieces, normal) for pieces in ties.pieces]
-    weights = barycentric(*(b - a for a, b in points), ties.two, ties.three)
+    weights = barycentric([b - a for a, b in points], ties.two, ties.three)
     result = Closest(
         normal, combine(weights, [a for a, _ in points]), combine(weights, [b for _, b in points]), ties, found.exact
     )
@@ -103,7 +103,8 @@ def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
         consistent = model - reach <= 4.0 * rounding
         code = (reach > state.best).astype(reach.dtype) + 2.0 * (reach > state.best - rounding) + 4.0 * consistent
         code = settle_code(jnp.where(state.done, 0.0, code))
-        better = (code & 1 == 1) | ((code >= 6) & ~state.exact)
+        # Near the solution the separation is flat: the latest consistent normal is the best, to more than half the digits.
+        better = (code >= 6) | ((code & 1 == 1) & ~state.exact)
         exact = (code & 4) == 4
         here = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
@@ -111,9 +112,11 @@ def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
             (state.best, state.best_normal, state.best_ties, state.exact),
         )
         still = dot(turned, turned) <= rounding * rounding
-        weights = barycentric(*points, state.ties.two, state.ties.three)
+        weights = barycentric(points, state.ties.two, state.ties.three)
         ties = _join(state.ties, pieces, weights, ~exact)
-        return _Search(state.turn + 1, normal, ties, *here, state.done | (exact & still if curved else exact))
+        best, best_normal, best_ties, exact_best = here
+        done = state.done | (exact & still if curved else exact)
+        return _Search(state.turn + 1, normal, ties, best, best_normal, best_ties, exact_best, done)
 
     curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
     extreme, pieces = shapes.least(simplex.direction)
@@ -145,7 +148,7 @@ def _join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
     return Ties((first, second, third), ties.two | (slot == 1), ties.three | (slot == 2))
 
 
-def distinct(pieces: tuple[Array, Array, Array]) -> Ties:
+def distinct(pieces: tuple[Array, ...]) -> Ties:
     """Sorts out repeated piece pairs (different points of one rim)."""
     first, second, third = pieces
     repeated = second == first
@@ -185,7 +188,7 @@ def _step(shapes: Difference, ties: Ties, normal: Vec3) -> Vec3:
     """One Newton step for the normal."""
     eps = float(jnp.finfo(normal.x.dtype).eps)
     points = [shapes.point(pieces, normal) for pieces in ties.pieces]
-    weights = barycentric(*points, ties.two, ties.three)
+    weights = barycentric(points, ties.two, ties.three)
     middle = combine(weights, points)
     separation = dot(normal, middle)
     curvatures = _curvatures(shapes, ties, weights, normal)
