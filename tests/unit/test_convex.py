@@ -19,16 +19,20 @@ from mathota_jax.spatial.vector import Vec3
 KINDS = ("sphere", "capsule", "box", "cylinder", "cone", "polyhedron")
 ROUND, FLAT = ("sphere", "capsule"), ("box", "polyhedron")
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
-QUICK = [("box", "polyhedron"), ("cylinder", "cone"), ("capsule", "polyhedron"), ("box", "cylinder"), ("sphere", "cone")]
+QUICK = [
+    ("box", "polyhedron"),
+    ("cylinder", "cone"),
+    ("capsule", "polyhedron"),
+    ("box", "cylinder"),
+    ("sphere", "cone"),
+]
 VERTICES = 12
 NORMAL_COUNT, SLOW_COUNT = 64, 952
 """Poses of one class: the slow sweep has 21 classes x 952 poses, 20,000 in all, in each precision."""
 
 
 def marked(pairs):
-    return [
-        pytest.param(pair, id="_".join(pair), marks=() if pair in QUICK else pytest.mark.slow) for pair in pairs
-    ]
+    return [pytest.param(pair, id="_".join(pair), marks=() if pair in QUICK else pytest.mark.slow) for pair in pairs]
 
 
 @pytest.fixture(params=["float32", "float64"])
@@ -45,7 +49,9 @@ def random_shape(kind, rng, count):
         return {"half_extents": rng.uniform(0.2, 1.0, (count, 3))}
     if kind == "polyhedron":
         points = rng.normal(size=(count, VERTICES, 3))
-        return {"vertices": points / np.linalg.norm(points, axis=2, keepdims=True) * rng.uniform(0.3, 1.0, (count, 1, 3))}
+        return {
+            "vertices": points / np.linalg.norm(points, axis=2, keepdims=True) * rng.uniform(0.3, 1.0, (count, 1, 3))
+        }
     names = ("radius",) if kind == "sphere" else ("radius", "half_height")
     return {name: rng.uniform(0.2, 1.0, count) for name in names}
 
@@ -70,7 +76,10 @@ def random_scene(pair, count, forms=("", ""), reach=2.0):
     rng = np.random.default_rng(zlib.crc32("_".join((*pair, *forms)).encode()))
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    scene = {side: stretched(random_shape(kind, rng, count), kind, f) for side, kind, f in zip("ab", pair, forms, strict=True)}
+    scene = {
+        side: stretched(random_shape(kind, rng, count), kind, f)
+        for side, kind, f in zip("ab", pair, forms, strict=True)
+    }
     scene["pa"] = rng.normal(size=(count, 3)) * 0.1
     scene["pb"] = scene["pa"] + direction * rng.uniform(0.0, reach, (count, 1))
     for side in "ab":
@@ -85,7 +94,12 @@ def rounded(scene, dtype):
 
 def to_engine(scene, dtype):
     def vector(rows):
-        return Vec3(*(jnp.asarray(rows[..., k].T[..., None, :] if rows.ndim == 3 else rows[None, :, k], dtype) for k in range(3)))
+        return Vec3(
+            *(
+                jnp.asarray(rows[..., k].T[..., None, :] if rows.ndim == 3 else rows[None, :, k], dtype)
+                for k in range(3)
+            )
+        )
 
     def shape(parameters):
         return {n: vector(v) if v.ndim > 1 else jnp.asarray(v[None], dtype) for n, v in parameters.items()}
@@ -179,7 +193,8 @@ class Placed:
     def size(self):
         directions = np.random.default_rng(0).normal(size=(50, 3))
         extents = [
-            max(np.linalg.norm(self.extreme(s, d) - self.sides[s][2]) for d in directions) + self.radii[s] for s in (0, 1)
+            max(np.linalg.norm(self.extreme(s, d) - self.sides[s][2]) for d in directions) + self.radii[s]
+            for s in (0, 1)
         ]
         return max(extents)
 
@@ -253,7 +268,9 @@ def check(pair, scene, dtype):
         # Inside the valid cone of normals: the separation along ours is the distance to the gate's precision.
         angle = np.degrees(np.arccos(np.clip(result.normal[index] @ normal, -1, 1)))
         valid = angle < 0.1 or abs(placed.reach(result.normal[index]) - truth) < share * size
-        witness = np.abs(result.point_b[index] - result.point_a[index] - result.separation[index] * result.normal[index])
+        witness = np.abs(
+            result.point_b[index] - result.point_a[index] - result.separation[index] * result.normal[index]
+        )
         on_surface = max(abs(distance_to(placed, s, p[index])) for s, p in enumerate((result.point_a, result.point_b)))
         if abs(error) > share * size or not valid or witness.max() > tight * size or on_surface > 2 * tight * size:
             failures.append((index, truth, error, angle, witness.max(), on_surface, bool(result.converged[index])))
@@ -285,7 +302,9 @@ def test_touching_and_shallow_poses(pair, gap, precision):
     assert np.all((result.separation < 0) == (gap < 0))
 
 
-@pytest.mark.parametrize("forms", [("needle", "plate"), ("plate", "plate"), ("needle", "needle"), ("small", ""), ("", "small")])
+@pytest.mark.parametrize(
+    "forms", [("needle", "plate"), ("plate", "plate"), ("needle", "needle"), ("small", ""), ("", "small")]
+)
 @pytest.mark.parametrize("pair", marked(PAIRS))
 def test_extreme_forms(pair, forms, precision):
     check(pair, random_scene(pair, NORMAL_COUNT, forms, reach=1.0), precision)
@@ -303,7 +322,14 @@ def test_support_points_are_extreme(kind):
     with jax.enable_x64(True):
         rng = np.random.default_rng(3)
         shape, directions = random_shape(kind, rng, 200), rng.normal(size=(200, 3))
-        scene = {"a": shape, "b": shape, "pa": directions, "pb": directions, "qa": np.eye(4)[[0] * 200], "qb": np.eye(4)[[0] * 200]}
+        scene = {
+            "a": shape,
+            "b": shape,
+            "pa": directions,
+            "pb": directions,
+            "qa": np.eye(4)[[0] * 200],
+            "qb": np.eye(4)[[0] * 200],
+        }
         parameters, direction, *_ = to_engine(scene, np.float64)
         point, code = support(kind, parameters, direction)
         assert code.dtype == jnp.int32
@@ -319,7 +345,17 @@ def test_support_points_are_extreme(kind):
 def degenerate_scene(pair):
     turns = [Rotation.identity()]
     turns += [Rotation.from_rotvec(t * np.eye(3)[k]) for t in (1e-12, 1e-6, 1e-3, np.pi / 4, np.pi / 2) for k in (0, 2)]
-    offsets = [(0, 0, 0), (1e-9, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0), (1, 1, 1), (0, 0.95, 0), (0.5, 0, 0), (0, 2, 0)]
+    offsets = [
+        (0, 0, 0),
+        (1e-9, 0, 0),
+        (1, 0, 0),
+        (0, 1, 0),
+        (1, 1, 0),
+        (1, 1, 1),
+        (0, 0.95, 0),
+        (0.5, 0, 0),
+        (0, 2, 0),
+    ]
     table = list(itertools.product(offsets, turns))
     count = len(table)
     cube = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
@@ -349,7 +385,9 @@ def test_degenerate_poses(pair, precision):
 
     def everything(*arguments):
         contact = call(pair, *arguments)
-        return sum(jnp.sum(x) for x in jax.tree.leaves((contact.normal, contact.separation, contact.point_a, contact.point_b)))
+        return sum(
+            jnp.sum(x) for x in jax.tree.leaves((contact.normal, contact.separation, contact.point_a, contact.point_b))
+        )
 
     arguments = to_engine(scene, precision)
     gradient = jax.grad(everything, argnums=tuple(range(6)))
