@@ -228,7 +228,8 @@ def test_shapes_on_a_plate(name, plate, precision):
     ]
     scene = resting(shape, PLATES[plate], turns, rng.uniform(-0.8, 0.8, (COUNT, 2)))
     result = Result(scene, precision)
-    np.testing.assert_allclose(result.deepest, -1e-3, atol=1e-7 if precision == np.float64 else 4e-6)
+    # Points within `depth_tolerance` (2e-7 of the size in float64) of the deepest count as equally deep.
+    np.testing.assert_allclose(result.deepest, -1e-3, atol=3e-7 if precision == np.float64 else 4e-6)
     points = seen_from_plate(scene, result)
     for index in range(COUNT):
         active = result.active[index]
