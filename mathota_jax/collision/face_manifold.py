@@ -48,6 +48,7 @@ class _Face(NamedTuple):
     """
 
     corners: Vec3
+    center: Vec3
     normal: Vec3
     left: Vec3 | None
     breadth: Array
@@ -164,12 +165,14 @@ def _world_face(kind: str, shape: dict[str, Any], pose: Pose, outward: Vec3, ori
     face = FACES[kind].function(shape, pose.rotation.apply_transposed(outward))
     corners = compute_once(face.corners, origin.x)
     corners = pose.rotation.apply(corners) + (pose.position - origin)
-    corners, world_normal = compute_once((corners, pose.rotation.apply(face.normal)), corners.x)
+    # Plane through the middle, not a corner, which may be far away and round off.
+    center = corners.map(lambda c: jnp.mean(c, axis=0))
+    corners, center, world_normal = compute_once((corners, center, pose.rotation.apply(face.normal)), origin.x)
     left = None
     if FACES[kind].flatness < 2:
         span = corners.map(lambda c: c[1] - c[0])
         left = lax.stop_gradient(normalize(cross(outward, span)) * face.breadth)
-    return _Face(corners, world_normal, left, lax.stop_gradient(face.breadth), face.corner_ids)
+    return _Face(corners, center, world_normal, left, lax.stop_gradient(face.breadth), face.corner_ids)
 
 
 def _outline(face: _Face, normal: Vec3, turn: float) -> _Outline:
@@ -309,8 +312,7 @@ def _next(values: Array) -> Array:
 
 def _height(face: _Face, points: Vec3, normal: Vec3) -> Array:
     """Height of points over the plane of a face, measured along the contact normal."""
-    base = face.corners.map(lambda c: c[0])
-    return safe_divide(dot(face.normal, points - base), jnp.abs(dot(face.normal, normal)))
+    return safe_divide(dot(face.normal, points - face.center), jnp.abs(dot(face.normal, normal)))
 
 
 def _points(
