@@ -9,6 +9,20 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.spatial.settle import settle_code, store
+from mathota_jax.spatial.vector import Vec3
+
+LEAN = Vec3(0.48, 0.36, 0.8)
+"""Unit vector toward which scores lean, so that equally good candidates do not take turns in a tremor."""
+LEAN_SHARE = 1e-3
+"""By this share of the distance along `LEAN`, where the score measures the spread of contacts."""
+
+
+def depth_lean(number: Any) -> float:
+    """The same share where it measures depth: the deepest contact is the deepest to this share of the size.
+
+    More than the tremor of a body at rest, less than the error that matters (a tilt of 2e-7 rad, in float32 8e-6).
+    """
+    return max(2e-7, 64.0 * float(jnp.finfo(number).eps))
 
 
 def best_candidate(score: Array) -> tuple[Array, Array]:

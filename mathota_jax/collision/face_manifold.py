@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.candidates import best_candidate, pick
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_lean, pick
 from mathota_jax.collision.closest import clamp
 from mathota_jax.collision.faces import FACES
 from mathota_jax.collision.manifold import ContactPoint, Manifold
@@ -37,12 +37,6 @@ LINE_DISTANCE = 1e-5
 """Points closer than this share of the size to the line through two others add nothing to them."""
 HEIGHT_WEIGHT = 10.0
 """A point higher than the deepest one must widen the patch by this many times the height (see `plane_polyhedron`)."""
-LEAN = Vec3(0.48, 0.36, 0.8)
-LEAN_SHARE = 1e-3
-"""Scores lean to one side by this share, so that equally good points do not take turns in a tremor. The search for the
-deepest point leans by eps^(3/4) only."""
-DEPTH_TOLERANCE = 5e-10
-"""The witness point is kept beside the patch where it is deeper by more than this share of the reach, or 64 eps."""
 
 
 class _Face(NamedTuple):
@@ -212,7 +206,7 @@ def _search(
 
     both_segments = jnp.minimum(reference.breadth, incident.breadth) > 0
     breadth = reference.breadth + incident.breadth
-    merge = jnp.where(both_segments, 4.0 * breadth, MERGE_DISTANCE * size)
+    merge = jnp.where(both_segments, 6.0 * breadth, MERGE_DISTANCE * size)
     line = LINE_DISTANCE * size + 3.0 * breadth
     lowest = jnp.finfo(number).min
 
@@ -221,11 +215,12 @@ def _search(
         score, code = best_candidate(jnp.where(usable_here, widening - penalty, lowest))
         return jnp.where(score > lowest, code, -1)
 
-    slope = jnp.finfo(number).eps ** 0.75 / LEAN_SHARE
-    deepest = winner(-candidates.gap, lowest, -slope * lean)
+    share = depth_lean(number)
+    deepest = winner(-candidates.gap, lowest, -share / LEAN_SHARE * lean)
     u0, v0, gap0 = pick((candidates.u, candidates.v, candidates.gap), deepest)
-    reach = size + norm(pick(incident.corners, jnp.zeros_like(deepest))) + jnp.abs(separation)
-    tolerance = max(DEPTH_TOLERANCE, 64.0 * float(jnp.finfo(number).eps)) * reach
+    # The witness point is deeper than the patch: it lies outside of the polygons, on the rim of a disc.
+    reach = size + norm(incident.corners.map(lambda c: c[0])) + jnp.abs(separation)
+    tolerance = 2.0 * share * reach
     misses = settle_code(((deepest < 0) | (gap0 > separation + tolerance)).astype(number)) == 1
     u0, v0, gap0 = (jnp.where(misses, value, other) for value, other in ((0.0, u0), (0.0, v0), (separation, gap0)))
 
@@ -242,7 +237,9 @@ def _search(
         jnp.maximum(turn * _beyond(du - u1, dv - v1, u2 - u1, v2 - v1), -turn * _beyond(du, dv, u2, v2)),
     )
     fourth_code = winner(outside, jnp.where(third_code < 0, jnp.inf, line), penalty)
-    return jnp.stack([jnp.where(misses, -1, deepest), second_code, third_code, fourth_code]), misses
+    # A patch of no extent is the witness point.
+    alone = misses | (second_code < 0)
+    return jnp.stack([jnp.where(alone, -1, deepest), second_code, third_code, fourth_code]), alone
 
 
 def _extent(face: _Face) -> Array:

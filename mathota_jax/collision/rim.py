@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.collision.candidates import depth_lean
 from mathota_jax.spatial.safe import safe_sqrt
 from mathota_jax.spatial.settle import settle_code
 
@@ -29,7 +30,7 @@ def rim_points(toward_x: Array, toward_z: Array) -> RimPoints:
 
     As a set the four move continuously with the direction: where the farthest one changes its quadrant the square
     takes the same place a quarter turn on. A direction along the axis has no farthest point; its tremor must not spin
-    the contacts of a resting cylinder. So below a lateral share of eps^(2/3) the square turns back to the axes, which
+    the contacts of a resting cylinder. So below a lateral share of `depth_lean` the square turns back to the axes, which
     costs the farthest point 0.08 of that share of the radius, and bounds the derivative.
     """
     x, z = lax.stop_gradient((toward_x, toward_z))
@@ -38,7 +39,7 @@ def rim_points(toward_x: Array, toward_z: Array) -> RimPoints:
     # Components along the quadrant's own direction and the next one.
     cosine, sine = _turn(quadrant, x.dtype)
     minor = toward_z * cosine - toward_x * sine
-    fade = jnp.finfo(x.dtype).eps ** (2.0 / 3.0)
+    fade = depth_lean(x.dtype)
     squared = toward_x * toward_x + toward_z * toward_z
     across = minor * safe_sqrt(squared) / (squared + fade * fade)
     along = jnp.sqrt(1.0 - across * across)  # `across` is at most sin 45 deg

@@ -330,7 +330,8 @@ def test_degenerate_poses_stay_finite_and_right(pair, precision):
     scene = fixed_scene(pair, [o for o, _ in table], [t for _, t in table])
     result = Result(pair, scene, precision)
     truth = np.array([oracle(pair, scene, k) for k in range(len(table))])
-    np.testing.assert_allclose(result.deepest, truth, atol=1e-9 if precision == np.float64 else 2e-6)
+    # A tilt of 1e-12 is below that at which the deepest rim point counts; 1e-6 is above.
+    np.testing.assert_allclose(result.deepest, truth, atol=1e-8 if precision == np.float64 else 2e-6)
     np.testing.assert_allclose(np.linalg.norm(result.normal, axis=1), 1.0, atol=1e-5)
 
     def everything(*values):
@@ -430,10 +431,11 @@ def test_rolling_moves_the_points_continuously(pair, float64):
         assert gaps.min(0).max() < 1.2 * 0.5 * (angles[1] - angles[0])
 
 
-@pytest.mark.parametrize(("pair", "points", "height", "area"), STANDING[:3], ids=["cylinder", "cone", "box"])
+@pytest.mark.parametrize(("pair", "points", "height", "area"), STANDING, ids=["cylinder", "cone", "box", "hexagon"])
 def test_features_persist_in_a_tremor(pair, points, height, area, precision):
     rng = np.random.default_rng(7)
-    turns = [Rotation.from_rotvec(1e-6 * rng.normal(size=3)) for _ in range(256)]
+    tremor = 1e-6 if precision == np.float32 else 1e-8
+    turns = [Rotation.from_rotvec(tremor * rng.normal(size=3)) for _ in range(256)]
     result = Result(pair, fixed_scene(pair, np.tile([0, height, 0], (256, 1)), turns, points=points), precision)
     features = result.features()
     assert len(set(features[0])) == 4

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.candidates import best_candidate, pick
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_lean, pick
 from mathota_jax.collision.closest import round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
@@ -19,14 +19,10 @@ HEIGHT_WEIGHT = 10.0
 0.1 rad brings down counts as base."""
 MERGE_DISTANCE = 1e-5
 """A vertex must widen the base by this share of the size to be a point of its own."""
-LEAN = Vec3(0.48, 0.36, 0.8)
-LEAN_SHARE = 1e-3
-"""Scores lean to one side of the body by this share, so that equally good vertices do not take turns in a tremor. The
-search for the deepest vertex leans by eps^(3/4) only: it is the deepest to that share of the size."""
 
 
 def plane_polyhedron(plane: dict[str, Any], _: Pose, polyhedron: dict[str, Any], pose: Pose) -> Manifold:
-    """Up to four contacts, the deepest vertex first. The feature is the number of the vertex."""
+    """Up to four contacts, the deepest vertex (see `depth_lean`) first. The feature is the number of the vertex."""
     assert pose.rotation is not None
     normal, vertices = plane["normal"], polyhedron["vertices"]
     codes = base_vertices(lax.stop_gradient(vertices), lax.stop_gradient(pose.rotation.apply_transposed(normal)))
@@ -48,7 +44,7 @@ def base_vertices(vertices: Vec3, up: Vec3) -> tuple[Array, Array, Array, Array]
     lean = dot(LEAN, vertices)
     height = dot(vertices, up)
     number = height.dtype
-    _, first = best_candidate(lean * jnp.finfo(number).eps ** 0.75 - height)
+    _, first = best_candidate(lean * depth_lean(number) - height)
     lowest = pick(vertices, first)
     offset = vertices - lowest
     rise = dot(offset, up)

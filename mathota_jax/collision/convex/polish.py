@@ -1,0 +1,215 @@
+"""From the pieces that the search found to exact, differentiable distances, normals and witness points.
+
+The separation is the maximum over unit directions n of ``min_i s_i(n)``, where ``s_i(n) = n . w_i(n)`` belongs to a piece
+pair and is smooth. At the solution up to three piece pairs tie. With three, n is the normal of the triangle they span (a
+face with a vertex, two crossed edges, the side of a cylinder with an edge ...): well conditioned at touch, where the
+difference vector vanishes. With two, n is perpendicular to their difference and stationary along the circle that leaves
+free; with one, stationary in both tangent directions. The stationarity is solved by Newton's method with the curvature of
+the rims; shapes without rims need a single step.
+
+The last step is taken differentiably from the undifferentiated solution: by the implicit function theorem it gives the
+derivative of n, hence those of witness points, and second derivatives of the separation (envelope theorem).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.collision.convex.difference import CODES, Difference, Weights, barycentric, combine, unit
+from mathota_jax.collision.convex.gjk import Simplex
+from mathota_jax.collision.convex.support import SUPPORT
+from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import settle_code
+from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis, where
+
+NEWTON_STEPS = 5
+LONGEST_STEP = 0.5
+"""Newton steps turn the normal by at most this angle [rad]; a longer one means that the pieces are not the right ones."""
+ROUNDING = 16.0
+"""Separations that differ by fewer round-offs of the size are equal."""
+STIFFNESS_ROUNDING = 64.0
+"""A stiffness below this many round-offs leaves the normal where it is."""
+
+
+class Ties(NamedTuple):
+    """Distinct piece pairs that are extreme at once: the first always, the others where `two`, `three`."""
+
+    pieces: tuple[Array, Array, Array]
+    two: Array
+    three: Array
+
+
+class Closest(NamedTuple):
+    """Unit normal from A to B and the closest points of the cores, in the frame of A, in units of the scale."""
+
+    normal: Vec3
+    point_a: Vec3
+    point_b: Vec3
+    ties: Ties
+    converged: Array
+
+
+def polish(shapes: Difference, simplex: Simplex) -> Closest:
+    """Exact closest points from the pieces of the closest simplex. Differentiable in the shapes."""
+    frozen, simplex = lax.stop_gradient((shapes, simplex))
+    ties = distinct(simplex.pieces)
+    curved = _curved(shapes)
+    if curved:
+        found = lax.fori_loop(0, NEWTON_STEPS, lambda _, n: _step(frozen, ties, n), simplex.direction)
+    else:
+        found = _step(frozen, ties, simplex.direction)
+    # The true separation along any direction is a lower bound: the larger, the better.
+    rounding = ROUNDING * float(jnp.finfo(found.x.dtype).eps)
+    before, after = _reach(frozen, simplex.direction), _reach(frozen, found)
+    model = dot(found, frozen.point(ties.pieces[0], found))
+    worse = settle_code((after < before - rounding).astype(found.x.dtype)) == 1
+    start = where(worse, simplex.direction, found)
+    converged = ~worse & (model - after <= 4.0 * rounding)
+
+    stepped = _step(shapes, ties, start)
+    normal = where(worse, start, stepped)
+    points = [shapes.points(pieces, normal) for pieces in ties.pieces]
+    weights = barycentric(*(b - a for a, b in points), ties.two, ties.three)
+    result = Closest(
+        normal, combine(weights, [a for a, _ in points]), combine(weights, [b for _, b in points]), ties, converged
+    )
+    best = jnp.where(worse, before, after)
+    for of_b, kind in enumerate((shapes.kind_a, shapes.kind_b)):
+        if SUPPORT[kind].rim_radius is not None:
+            result, best = _flat_end(shapes, simplex, result, best, bool(of_b), rounding)
+    return result
+
+
+def distinct(pieces: tuple[Array, Array, Array]) -> Ties:
+    """Sorts out repeated piece pairs (different points of one rim)."""
+    first, second, third = pieces
+    repeated = second == first
+    second, third = jnp.where(repeated, third, second), jnp.where(repeated, first, third)
+    two = second != first
+    return Ties((first, second, third), two, two & (third != first) & (third != second))
+
+
+def _curved(shapes: Difference) -> bool:
+    return any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
+
+
+def _reach(shapes: Difference, direction: Vec3) -> Array:
+    """True separation along a unit direction."""
+    return dot(direction, shapes.least(direction)[0])
+
+
+def _rim_tangent(direction: Vec3) -> tuple[Vec3, Array]:
+    """Unit tangent of circles about the y axis at their extreme point along a direction, and 1 / |direction in plane|."""
+    zero = jnp.zeros_like(direction.x)
+    inverse = safe_divide(jnp.ones_like(zero), norm(Vec3(direction.x, zero, direction.z)))
+    return Vec3(-direction.z * inverse, zero, direction.x * inverse), inverse
+
+
+def _curvatures(shapes: Difference, ties: Ties, weights: Weights, normal: Vec3) -> list[tuple[Vec3, Array]]:
+    """Minus the Hessian of the tied separations, as a sum of ``curvature * tangent tangent^T``."""
+    result = []
+    for of_b, kind, shape in ((False, shapes.kind_a, shapes.a), (True, shapes.kind_b, shapes.b)):
+        rim_radius = SUPPORT[kind].rim_radius
+        if rim_radius is None:
+            continue
+        local = shapes.rotation.apply_transposed(normal) if of_b else normal
+        tangent, inverse = _rim_tangent(local)
+        codes = [pieces % CODES if of_b else pieces // CODES for pieces in ties.pieces]
+        radius = sum((w * rim_radius(shape, c) for w, c in zip(weights, codes, strict=True)), jnp.zeros_like(inverse))
+        result.append((shapes.rotation.apply(tangent) if of_b else tangent, radius * inverse))
+    return result
+
+
+def _step(shapes: Difference, ties: Ties, normal: Vec3) -> Vec3:
+    """One Newton step for the normal."""
+    eps = float(jnp.finfo(normal.x.dtype).eps)
+    points = [shapes.point(pieces, normal) for pieces in ties.pieces]
+    weights = barycentric(*points, ties.two, ties.three)
+    middle = combine(weights, points)
+    separation = dot(normal, middle)
+    curvatures = _curvatures(shapes, ties, weights, normal)
+
+    # Three ties: the normal of their triangle.
+    edge, other = points[1] - points[0], points[2] - points[0]
+    face = cross(edge, other)
+    squared = dot(face, face)
+    usable = ties.three & (squared > 0)
+    face = face * (lax.rsqrt(jnp.where(usable, squared, 1.0)) * jnp.where(dot(face, normal) < 0, -1.0, 1.0))
+
+    # Two ties: perpendicular to the edge, stationary along the tangent.
+    inverse = safe_divide(jnp.ones_like(separation), norm(edge))
+    along = edge * inverse
+    tangent = cross(normal, along)
+    alpha = -dot(normal, along)
+    stiffness = separation + sum(k * dot(t, tangent) ** 2 for t, k in curvatures)
+    coupling = sum(k * dot(t, tangent) * dot(t, along) for t, k in curvatures)
+    force = dot(tangent, middle) - coupling * alpha
+    firm = ties.two & (jnp.abs(stiffness) > STIFFNESS_ROUNDING * eps)
+    beta = jnp.where(firm, force / jnp.where(firm, stiffness, 1.0), 0.0)
+    line = along * alpha + tangent * beta
+
+    # One: stationary in both tangent directions.
+    basis = tangent_basis(normal)
+    force_1, force_2 = dot(basis[0], middle), dot(basis[1], middle)
+    k11 = separation + sum(k * dot(t, basis[0]) ** 2 for t, k in curvatures)
+    k22 = separation + sum(k * dot(t, basis[1]) ** 2 for t, k in curvatures)
+    k12 = sum((k * dot(t, basis[0]) * dot(t, basis[1]) for t, k in curvatures), jnp.zeros_like(separation))
+    determinant = k11 * k22 - k12 * k12
+    scale = jnp.abs(k11) + jnp.abs(k22)
+    firm = jnp.abs(determinant) > STIFFNESS_ROUNDING * eps * jnp.maximum(scale, STIFFNESS_ROUNDING * eps) * scale
+    inverse = jnp.where(firm, 1.0 / jnp.where(firm, determinant, 1.0), 0.0)
+    spot = basis[0] * ((k22 * force_1 - k12 * force_2) * inverse) + basis[1] * (
+        (k11 * force_2 - k12 * force_1) * inverse
+    )
+
+    change = where(ties.two, line, spot)
+    moderate = dot(change, change) < LONGEST_STEP**2
+    moved = where(usable, face, where(moderate, normal + change, normal))
+    return moved * lax.rsqrt(dot(moved, moved))
+
+
+def _flat_end(
+    shapes: Difference, simplex: Simplex, result: Closest, best: Array, of_b: bool, rounding: float
+) -> tuple[Closest, Array]:
+    """Contact with the flat end of a cylinder or cone, where its axis separates best: the end's normal is exact.
+
+    The other body's point is its extreme one. Where the search's point is extreme too (parallel faces) it is taken,
+    carried along by the body: it lies over the end.
+    """
+    frozen = lax.stop_gradient(shapes)
+    axis = shapes.rotation.column_y if of_b else Vec3(*(jnp.full_like(best, c) for c in (0.0, 1.0, 0.0)))
+    upward = settle_code((dot(lax.stop_gradient(axis), simplex.direction) >= 0).astype(best.dtype)) == 1
+    normal = axis * jnp.where(upward, 1.0, -1.0)
+    along = _reach(frozen, lax.stop_gradient(normal))
+    chosen = settle_code((along >= best - rounding).astype(best.dtype)) == 1
+
+    pieces = frozen.pieces(lax.stop_gradient(normal))
+    point_a, point_b = shapes.points(pieces, normal)
+    other, searched = (point_a, simplex.point_a) if of_b else (point_b, simplex.point_b)
+    offset = searched - lax.stop_gradient(other)
+    tied = jnp.abs(dot(lax.stop_gradient(normal), offset)) <= 64.0 * rounding
+    offset = offset * jnp.where(tied, 1.0, 0.0)
+    if not of_b:  # carried along by B; A is at rest in its own frame
+        offset = shapes.rotation.apply(lax.stop_gradient(shapes.rotation).apply_transposed(offset))
+    other = other + offset
+    gap = dot(normal, point_b - point_a)
+    point_a, point_b = (other, other + normal * gap) if of_b else (other - normal * gap, other)
+    return (
+        Closest(
+            where(chosen, normal, result.normal),
+            where(chosen, point_a, result.point_a),
+            where(chosen, point_b, result.point_b),
+            jax.tree.map(lambda new, old: jnp.where(chosen, new, old), _single(pieces), result.ties),
+            chosen | result.converged,
+        ),
+        jnp.where(chosen, along, best),
+    )
+
+
+def _single(pieces: Array) -> Ties:
+    none = jnp.zeros_like(pieces, dtype=bool)
+    return Ties((pieces, pieces, pieces), none, none)
