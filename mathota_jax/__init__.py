@@ -1,6 +1,7 @@
 """mathota_jax: a differentiable rigid-body contact engine in JAX. This module is the whole public API."""
 
 from mathota_jax.builder import SceneBuilder
+from mathota_jax.collision.raycast import Raycast, raycast
 from mathota_jax.constraints.joints.hinge import Hinge
 from mathota_jax.constraints.joints.slider import Slider
 from mathota_jax.diagnostics import (
@@ -50,6 +51,7 @@ __all__ = [
     "Options",
     "Plane",
     "Polyhedron",
+    "Raycast",
     "Scene",
     "SceneBuilder",
     "Slider",
@@ -65,6 +67,7 @@ __all__ = [
     "joint_velocity",
     "manifold",
     "momentum",
+    "raycast",
     "rollout",
     "signed_distance",
     "step",

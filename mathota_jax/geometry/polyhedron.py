@@ -39,7 +39,7 @@ class Polyhedron(Shape):
         if len(hull.vertices) > VERTEX_LIMIT:
             raise ValueError(
                 f"{name} has a hull of {len(hull.vertices)} corners, at most {VERTEX_LIMIT} are possible; simplify it, "
-                "for example by mathota_jax.io.meshes.simplified_hull"
+                "for example by mathota_jax.io.simplified_hull"
             )
         self.vertices = hull.vertices
         self.faces: Faces = hull.faces

@@ -3,12 +3,26 @@
 import dataclasses
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mathota_jax import Box, Compound, Cylinder, Polyhedron, SceneBuilder, Sphere, angular_momentum, energy
+from mathota_jax import (
+    Box,
+    Compound,
+    Cylinder,
+    Plane,
+    Polyhedron,
+    SceneBuilder,
+    Sphere,
+    angular_momentum,
+    contact_forces,
+    contacts,
+    energy,
+    rollout,
+)
 from tests.scenes import angle_between, record_worlds, repeat, undamped
 
 UNIT = (1.0, 0.0, 0.0, 0.0)
@@ -88,3 +102,42 @@ def test_a_box_described_otherwise_moves_like_the_box(name, float64, gate):
     gate("angle", angle_between(back.as_quat()[:, [3, 0, 1, 2]], box["orientation"][:, 0]), 1e-6)
     gate("position", twin["position"] - box["position"], 1e-6)
     gate("angular velocity", twin["angular_velocity"] - box["angular_velocity"], 1e-6)
+
+
+def changed(model, path, change):
+    return jax.tree_util.tree_map_with_path(lambda p, x: x + change if p == path else x, model)
+
+
+def test_derivatives_reach_every_parameter_of_a_compound(float64, gate):
+    """Directional derivatives of a fall, box first, onto a plane against central differences, leaf by leaf."""
+    parts = [(Box((0.2, 0.1, 0.15)), ((0.1, 0.5, 0.3), TURN)), (Sphere(0.2), ((0.2, -0.3, 0), UNIT))]
+
+    def build(height):
+        builder = SceneBuilder()
+        builder.add_body(Plane((0, 1, 0), 0.0), static=True, friction=0.3)
+        start = {"position": (0, height, 0), "orientation": (0, 1, 0, 0), "velocity": (0.3, -1, 0.2)}
+        builder.add_body(Compound(parts), density=500.0, friction=0.3, angular_velocity=(1, -2, 1), **start)
+        return builder.build(undamped(dt=DT, velocity_iterations=40))
+
+    gap = float(contacts(*build(1.0)).separation.min())
+    model, state = build(1.0 - gap + 0.01)  # it lands in the third step
+    rng = np.random.default_rng(0)
+
+    @jax.jit
+    def outcome(model):
+        final, _ = rollout(model, state, 6)
+        return jnp.concatenate([final.position[1], final.orientation[1], final.angular_velocity[1]])
+
+    assert jnp.any(contact_forces(model, rollout(model, state, 6)[0]) != 0)
+    gradients = jax.jit(jax.jacrev(outcome))(model)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(model):
+        if leaf.size == 0 or path[0].name not in ("mass", "inertia", "inertia_frame", "shapes") or "plane" in str(path):
+            continue
+        direction = rng.normal(size=leaf.shape)
+        after, before = (outcome(changed(model, path, sign * 1e-7 * direction)) for sign in (1, -1))
+        difference = (after - before) / 2e-7
+        ours = dict(jax.tree_util.tree_leaves_with_path(gradients))[path]
+        ours = np.tensordot(ours, direction, leaf.ndim)
+        gate(jax.tree_util.keystr(path), np.abs(ours - difference).max() / (1.0 + np.abs(difference).max()), 1e-5)
+    for leaf in (gradients.inertia_frame[:, 1], *gradients.shapes["box"].values()):
+        assert np.abs(leaf).max() > 1e-3

@@ -23,6 +23,9 @@ from mathota_jax import (
     contacts,
     step,
 )
+from mathota_jax.bodies import unpack
+from mathota_jax.collision.placement import shape_parameters, shape_poses
+from mathota_jax.geometry.bounds import aabb
 from tests.scenes import rotation_matrix, undamped
 
 UNIT = (1.0, 0.0, 0.0, 0.0)
@@ -171,6 +174,47 @@ def test_polyhedra_of_different_size_share_one_array():
     np.testing.assert_array_equal(vertices[1, 6:], vertices[1, [0, 0]])
     assert [len(faces) for faces in model.scene.faces] == [6, 5]
     hash(model.scene)
+
+
+def test_placed_shapes_have_the_layout_of_pair_functions(float64):
+    """Vertices first, faces alike; every face of every pair outside of its polyhedron; bounds around the corners."""
+    wedge, cube = Polyhedron(WEDGE), Polyhedron(CORNERS)
+    builder = SceneBuilder()
+    hills = Heightfield(np.arange(12.0).reshape(3, 4), 0.5)
+    builder.add_body(hills, static=True, collides=False)
+    for shape in (cube, wedge, Compound([(wedge, ((0, 3, 0), OTHER)), (cube, ((0, -3, 0), TURN))])):
+        builder.add_body(shape, mass=1.0, position=(1, 2, 3), orientation=TURN, collides=False)
+    model, state = builder.build()
+    shapes = jax.tree.map(lambda x: x[..., None], model.shapes)
+    bodies = unpack(jax.tree.map(lambda x: x[..., None], state))
+    rows, owners = (0, 2, 1, 3, 2), (1, 3, 2, 3, 3)
+    found = shape_parameters(model.scene, shapes, "polyhedron", rows)
+    pose = shape_poses(shapes, "polyhedron", rows, owners, bodies.position, bodies.orientation)
+    vertices = np.stack([np.asarray(component)[..., 0] for component in found["vertices"]], axis=-1)
+    assert vertices.shape == (8, 5, 3)
+    assert found["faces"].dtype == np.int32
+    assert found["faces"].shape == (5, 6, 4)
+    low, high = (np.stack([np.asarray(c)[:, 0] for c in corner], -1) for corner in aabb("polyhedron", found, pose))
+    for pair, (shape, local, turn) in enumerate(
+        [
+            (cube, 0, UNIT),
+            (wedge, (0, 3, 0), OTHER),
+            (wedge, 0, UNIT),
+            (cube, (0, -3, 0), TURN),
+            (wedge, (0, 3, 0), OTHER),
+        ]
+    ):
+        truth = shape.vertices @ rotation_matrix(turn).T + local
+        truth = truth @ rotation_matrix(TURN).T + (1, 2, 3)
+        np.testing.assert_allclose(np.stack([low[pair], high[pair]]), [truth.min(0), truth.max(0)], rtol=1e-12)
+        corners = vertices[found["faces"][pair], pair]
+        assert {tuple(face) for face in found["faces"][pair]} == {f + f[-1:] * (4 - len(f)) for f in shape.faces}
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
+        inside = vertices[:, pair].mean(0)
+        assert np.all(np.einsum("fx,fx->f", normal, corners[:, 0] - inside) > 0)
+    field = shape_parameters(model.scene, shapes, "heightfield", (0,))
+    assert field["heights"].shape == (3, 4, 1, 1)
+    assert shape_parameters(model.scene, shapes, "polyhedron", (1, 1, 1))["faces"].shape == (1, 5, 4)
 
 
 def test_joint_anchors_are_seen_from_the_centre_of_mass(float64):
