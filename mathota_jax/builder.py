@@ -21,7 +21,7 @@ from mathota_jax.model import Model
 from mathota_jax.options import Options
 from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate, rotate_back
 from mathota_jax.scene import JointEntry, PairGroup, Scene, ShapeEntry
-from mathota_jax.shape_table import ShapeTable, shape_table
+from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
 from mathota_jax.state import State
 
 
@@ -200,7 +200,7 @@ class SceneBuilder:
         if not self._bodies:
             raise ValueError("build: the scene has no body; call add_body first")
         table = shape_table(self._bodies)
-        scene = self._scene(table, self._pair_groups(table.entries), options)
+        scene = self._scene(table, self._pair_groups(table), options)
         return self._model(scene, table, options.dt), self._state(scene)
 
     def _scene(self, table: ShapeTable, groups: tuple[PairGroup, ...], options: Options) -> Scene:
@@ -269,12 +269,12 @@ class SceneBuilder:
             flags=jnp.zeros((), jnp.int32),
         )
 
-    def _pair_groups(self, shapes: tuple[ShapeEntry, ...]) -> tuple[PairGroup, ...]:
+    def _pair_groups(self, table: ShapeTable) -> tuple[PairGroup, ...]:
         """Admissible pairs: not both static, not joined by a joint, both colliding."""
         joined = {frozenset((joint.parent, joint.child)) for joint in self._joints}
         order = list(SHAPES)
         members: dict[tuple[str, str], list[tuple[ShapeEntry, ShapeEntry]]] = {}
-        for first, second in itertools.combinations(shapes, 2):
+        for first, second in itertools.combinations(table.entries, 2):
             one, two = self._bodies[first.body], self._bodies[second.body]
             if (one.static and two.static) or not (one.collides and two.collides):
                 continue
@@ -296,6 +296,7 @@ class SceneBuilder:
                 tuple(b.index for _, b in pairs),
                 tuple(a.body for a, _ in pairs),
                 tuple(b.body for _, b in pairs),
+                heightfield_window(table, pairs) if kind_b == "heightfield" else None,
             )
             for (kind_a, kind_b), pairs in sorted(
                 members.items(), key=lambda item: (order.index(item[0][0]), order.index(item[0][1]))

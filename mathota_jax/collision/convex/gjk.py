@@ -100,7 +100,15 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
     first = unit(start, Vec3(one, zero, zero))
     none = jnp.zeros(jnp.shape(zero), jnp.int32)
     state = _State(
-        jnp.zeros((), jnp.int32), first, zero + jnp.inf, (first,) * 3, (first,) * 3, (none,) * 3, none, none < 0, ~wanted | (none < 0)
+        jnp.zeros((), jnp.int32),
+        first,
+        zero + jnp.inf,
+        (first,) * 3,
+        (first,) * 3,
+        (none,) * 3,
+        none,
+        none < 0,
+        ~wanted | (none < 0),
     )
     state = lax.while_loop(lambda s: (s.turn < iterations) & ~jnp.all(s.done), advance, state)
     pieces = (

@@ -6,6 +6,15 @@ from mathota_jax.collision.manifold import Manifold
 from mathota_jax.collision.pairs.box_box import box_box
 from mathota_jax.collision.pairs.capsule_box import capsule_box
 from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule
+from mathota_jax.collision.pairs.convex_heightfield import (
+    HEIGHTFIELD_POINTS,
+    box_heightfield,
+    capsule_heightfield,
+    cone_heightfield,
+    cylinder_heightfield,
+    polyhedron_heightfield,
+    sphere_heightfield,
+)
 from mathota_jax.collision.pairs.plane_box import plane_box
 from mathota_jax.collision.pairs.plane_capsule import plane_capsule
 from mathota_jax.collision.pairs.plane_sphere import plane_sphere
@@ -40,6 +49,12 @@ PAIRS: dict[tuple[str, str], Pair] = {
     ("capsule", "capsule"): Pair(capsule_capsule, 2),
     ("capsule", "box"): Pair(capsule_box, 2),
     ("box", "box"): Pair(box_box, 4),
+    ("sphere", "heightfield"): Pair(sphere_heightfield, HEIGHTFIELD_POINTS),
+    ("capsule", "heightfield"): Pair(capsule_heightfield, HEIGHTFIELD_POINTS),
+    ("box", "heightfield"): Pair(box_heightfield, HEIGHTFIELD_POINTS),
+    ("cylinder", "heightfield"): Pair(cylinder_heightfield, HEIGHTFIELD_POINTS),
+    ("cone", "heightfield"): Pair(cone_heightfield, HEIGHTFIELD_POINTS),
+    ("polyhedron", "heightfield"): Pair(polyhedron_heightfield, HEIGHTFIELD_POINTS),
 }
 
 __all__ = ["PAIRS", "Pair", "PairFunction"]
