@@ -156,3 +156,169 @@ def test_even_ground_is_a_plane(kind, slope, float64, gate):
         for point, gap in zip(*theirs, strict=True):
             worst = max(worst, np.min(np.linalg.norm(ours[0] - point, axis=1) + np.abs(ours[1] - gap)))
     gate("points", worst, 1e-12)
+
+
+# ---- hills: exact distances --------------------------------------------------------------------------------------
+
+HILLS = np.random.default_rng(5).normal(size=(11, 12)) * 0.12
+
+
+def grid_points(heights, cell=CELL):
+    rows, columns = heights.shape
+    along, across = (np.arange(rows) - 0.5 * (rows - 1)) * cell, (np.arange(columns) - 0.5 * (columns - 1)) * cell
+    return np.stack(np.broadcast_arrays(along[:, None], heights, across), -1)
+
+
+def triangles(heights, cell=CELL):
+    p = grid_points(heights, cell)
+    corner, opposite, beyond, beside = p[:-1, :-1], p[1:, 1:], p[1:, :-1], p[:-1, 1:]
+    parts = [np.stack([corner, beyond, opposite], -2), np.stack([corner, opposite, beside], -2)]
+    return np.concatenate([part.reshape(-1, 3, 3) for part in parts])
+
+
+def surface(heights, points, cell=CELL):
+    """Height of the ground at points (..., 3)."""
+    rows, columns = heights.shape
+    u, v = points[..., 0] / cell + 0.5 * (rows - 1), points[..., 2] / cell + 0.5 * (columns - 1)
+    i, j = np.clip(np.floor(u), 0, rows - 2).astype(int), np.clip(np.floor(v), 0, columns - 2).astype(int)
+    a, b = u - i, v - j
+    h = heights
+    left = h[i, j] + (h[i + 1, j] - h[i, j]) * a + (h[i + 1, j + 1] - h[i + 1, j]) * b
+    right = h[i, j] + (h[i + 1, j + 1] - h[i, j + 1]) * a + (h[i, j + 1] - h[i, j]) * b
+    return np.where(b > a, right, left)
+
+
+def nearest_on_segment(point, start, end):
+    span = end - start
+    share = np.clip(((point - start) * span).sum(-1) / (span * span).sum(-1), 0.0, 1.0)
+    return start + share[..., None] * span
+
+
+def nearest_on_triangles(point, corners):
+    """Nearest point of each triangle (triangle, 3, 3) to each point (..., 1, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    best = point - ((point - a) * normal).sum(-1, keepdims=True) * normal
+    inside = np.ones(best.shape[:-1], bool)
+    for start, end in ((a, b), (b, c), (c, a)):
+        inside &= (np.cross(end - start, best - start) * normal).sum(-1) >= 0
+    distance = np.where(inside, np.linalg.norm(point - best, axis=-1), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        other = nearest_on_segment(point, start, end)
+        away = np.linalg.norm(point - other, axis=-1)
+        best, distance = np.where((away < distance)[..., None], other, best), np.minimum(away, distance)
+    return best, distance
+
+
+def over_the_hills(kind, count, seed=11):
+    """Poses near the surface and which of them are clear of it."""
+    position, orientation = poses(count, seed, 0.55)
+    position[:, 1] += surface(HILLS, position) - 0.05
+    return position, orientation
+
+
+def test_sphere_distance_is_that_of_the_nearest_triangle(float64, gate):
+    position, orientation = over_the_hills("sphere", 400)
+    found = run("sphere", HILLS, position, orientation)
+    above = position[:, 1] > surface(HILLS, position)
+    assert above.sum() > 300
+    distance = nearest_on_triangles(position[:, None], triangles(HILLS))[1].min(1)
+    gate("separation", (found["separation"][0] - distance + SIZES["sphere"]["radius"])[above], 1e-12)
+    foot = position + found["normal"][0] * (found["separation"][0] + SIZES["sphere"]["radius"])[:, None]
+    gate("foot on the ground", (surface(HILLS, foot) - foot[:, 1])[above], 1e-12)
+    # A centre in the ground leaves upward.
+    assert (~above).sum() > 10 and found["active"][0][~above].all() and (found["normal"][0][~above][:, 1] < 0).all()
+    assert (found["separation"][0][~above] < -SIZES["sphere"]["radius"]).all()
+
+
+def samples(kind):
+    """Points all over the surface of a shape (of a capsule: of its axis)."""
+    if kind == "capsule":
+        axis = np.linspace(-1.0, 1.0, 801)[:, None]
+        return axis * [0.0, SIZES[kind]["half_height"], 0.0]
+    grid = np.linspace(-1.0, 1.0, 31)
+    if kind == "box":
+        cube = np.stack(np.meshgrid(grid, grid, grid), -1).reshape(-1, 3)
+        return cube[np.abs(cube).max(1) == 1] * SIZES[kind]["half_extents"]
+    if kind == "polyhedron":
+        parts = []
+        first, second = (x.ravel() for x in np.meshgrid(0.5 * (grid + 1), 0.5 * (grid + 1)))
+        inside = first + second <= 1
+        first, second = first[inside, None], second[inside, None]
+        for face in STONE_FACES:
+            corners = STONE[list(face)]
+            for k in range(1, len(corners) - 1):
+                parts.append(corners[0] * (1 - first - second) + corners[k] * first + corners[k + 1] * second)
+        return np.concatenate(parts)
+    radius, half = SIZES[kind]["radius"], SIZES[kind]["half_height"]
+    share, angle = (x.ravel() for x in np.meshgrid(0.5 * (grid + 1), np.linspace(0, 2 * np.pi, 120, endpoint=False)))
+    disc = radius * share[:, None] * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
+    rim = radius * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
+    if kind == "cylinder":
+        side = rim + (2 * share - 1)[:, None] * [0, half, 0]
+        return np.concatenate([side, disc - [0, half, 0], disc - [0, -half, 0]])
+    side = rim * (1 - share)[:, None] + (2.0 * share - 0.5)[:, None] * [0, half, 0]
+    return np.concatenate([side, disc - [0, 0.5 * half, 0]])
+
+
+def nearest_in_body(kind, point):
+    """Nearest point of the body (its core) to points (count, 3) outside of it, by formulas of its own."""
+    if kind == "capsule":
+        half = SIZES[kind]["half_height"]
+        return np.clip(point, [0, -half, 0], [0, half, 0])
+    if kind == "box":
+        return np.clip(point, -SIZES[kind]["half_extents"], SIZES[kind]["half_extents"])
+    if kind == "polyhedron":
+        corners = np.array([STONE[[f[0], f[k], f[k + 1]]] for f in STONE_FACES for k in range(1, len(f) - 1)])
+        best, distance = nearest_on_triangles(point[:, None], corners)
+        return best[np.arange(len(point)), distance.argmin(1)]
+    radius, half = SIZES[kind]["radius"], SIZES[kind]["half_height"]
+    across = np.hypot(point[:, 0], point[:, 2])
+    flat = np.stack([across, point[:, 1]], -1)
+    if kind == "cylinder":
+        best = np.clip(flat, [0, -half], [radius, half])
+    else:
+        rim, apex, middle = np.array([radius, -0.5 * half]), np.array([0, 1.5 * half]), np.array([0, -0.5 * half])
+        choices = np.stack([nearest_on_segment(flat, rim, apex), nearest_on_segment(flat, middle, rim)])
+        best = choices[np.linalg.norm(choices - flat, axis=-1).argmin(0), np.arange(len(point))]
+    direction = point[:, [0, 2]] / np.where(across > 0, across, 1.0)[:, None]
+    return np.stack([best[:, 0] * direction[:, 0], best[:, 1], best[:, 0] * direction[:, 1]], -1)
+
+
+@pytest.mark.parametrize("kind", KINDS[1:])
+def test_distance_from_hills(kind, float64, gate):
+    """Dense samples of the body find the nearest triangles, alternating projections the distance from each."""
+    count = 60
+    position, orientation = over_the_hills(kind, count)
+    position[:, 1] += 0.1
+    found = run(kind, HILLS, position, orientation)
+    turns = Rotation.from_quat(orientation[:, [1, 2, 3, 0]]).as_matrix()
+    ground = triangles(HILLS)
+    radius = SIZES[kind]["radius"] if kind == "capsule" else 0.0
+    errors = []
+    for world in range(count):
+        points = position[world] + samples(kind) @ turns[world].T
+        clearance = points[:, 1] - surface(HILLS, points)
+        if clearance.min() < 1e-3:
+            continue
+        lowest = points[np.argsort(clearance)[:: max(1, len(points) // 1500)][:700]]
+        distance = nearest_on_triangles(lowest[:, None], ground)[1]
+        for triangle in np.argsort(distance.min(0))[:8]:
+            point = lowest[distance[:, triangle].argmin()]
+            for _ in range(3000):
+                on_ground = nearest_on_triangles(point[None, None], ground[triangle][None])[0][0]
+                before, point = (
+                    point,
+                    position[world]
+                    + nearest_in_body(kind, (on_ground - position[world]) @ turns[world])[0] @ turns[world].T,
+                )
+                if np.linalg.norm(point - before) < 1e-12:
+                    break
+            errors.append((world, np.linalg.norm(point - on_ground[0])))
+    errors = np.array(errors)
+    worlds = np.unique(errors[:, 0]).astype(int)
+    assert len(worlds) >= 12
+    truth = np.array([errors[errors[:, 0] == world, 1].min() for world in worlds])
+    least = np.where(found["active"], found["separation"], np.inf).min(0)
+    gate("separation", least[worlds] + radius - truth, 1e-8)
