@@ -1,11 +1,14 @@
 """Convex shapes against heightfields: float64 oracles, the plane as the limit of flat ground, derivatives, scenes."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mathota_jax import Box, Capsule, Heightfield, Options, Plane, Polyhedron, SceneBuilder, Sphere, step
 from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.pairs.plane_box import plane_box
@@ -16,6 +19,7 @@ from mathota_jax.collision.pairs.plane_polyhedron import plane_polyhedron
 from mathota_jax.collision.pairs.plane_sphere import plane_sphere
 from mathota_jax.geometry import SHAPES
 from mathota_jax.geometry.hull import padded_faces
+from mathota_jax.queries import Geometry, manifold, signed_distance
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3
@@ -322,3 +326,208 @@ def test_distance_from_hills(kind, float64, gate):
     truth = np.array([errors[errors[:, 0] == world, 1].min() for world in worlds])
     least = np.where(found["active"], found["separation"], np.inf).min(0)
     gate("separation", least[worlds] + radius - truth, 1e-8)
+
+
+# ---- derivatives -------------------------------------------------------------------------------------------------
+
+
+def deepest(kind, position, orientation, heights, cell, sizes):
+    """Separation, normal and position of slot 0 (world, 7), its feature and whether it is active."""
+    pose = place(position, orientation / jnp.linalg.norm(orientation, axis=-1, keepdims=True))
+    field = field_of(heights, cell, REACH[kind])
+    still = place(jnp.zeros((1, 3)), jnp.asarray(UPRIGHT)[None])
+    found = PAIRS[kind, "heightfield"].function(shape_of(kind, sizes), pose, field, still)
+    point = found.points[0]
+    values = jnp.stack([point.separation[0], *(c[0] for c in found.normal), *(c[0] for c in point.position)], -1)
+    return values, point.feature[0], point.active[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_derivatives_are_those_of_differences(kind, float64, gate):
+    """By the pose, the heights, the cell size and the sizes of the body, along random directions."""
+    count, step = 60, 1e-6
+    position, orientation = over_the_hills(kind, count, 12)
+    position[:, 1] += 0.1
+    arguments = (position, orientation, HILLS, np.array(CELL), SIZES[kind])
+    arguments = jax.tree.map(jnp.asarray, arguments)
+    rng = np.random.default_rng(3)
+    tangents = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), arguments)
+
+    @jax.jit
+    def along(*arguments):
+        values, rates, (feature, active) = jax.jvp(
+            lambda *x: (lambda v, *rest: (v, rest))(*deepest(kind, *x)), arguments, tangents, has_aux=True
+        )
+        return values, rates, feature, active
+
+    _, rate, feature, active = along(*arguments)
+    ahead, behind = (along(*jax.tree.map(lambda x, t, s=s: x + s * t, arguments, tangents)) for s in (step, -step))
+    same = active & (feature == ahead[2]) & (feature == behind[2])
+    assert same.sum() > 0.8 * count
+    difference = (ahead[0] - behind[0]) / (2 * step)
+    gate("derivative", jnp.where(same[:, None], rate - difference, 0.0), 1e-6)
+    # Reverse mode: the same numbers, and none that is not finite.
+    weights = jnp.asarray(rng.normal(size=rate.shape))
+    gradient = jax.jit(jax.grad(lambda x: jnp.sum(weights * deepest(kind, *x)[0])))(arguments)
+    total = sum(jnp.sum(g * t) for g, t in zip(jax.tree.leaves(gradient), jax.tree.leaves(tangents), strict=True))
+    gate("reverse mode", total / jnp.sum(weights * rate) - 1.0, 1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_beside_the_field_there_is_no_ground(kind, precision):
+    reach = REACH[kind]
+    edge = 5.0 * CELL + reach
+    position = np.array([[edge + 0.01, 0.0, 0.0], [-50.0, -3.0, 80.0], [0.0, 0.1, 1e5], [0.0, 0.0, 0.0]])
+    orientation = np.tile(UPRIGHT, (4, 1))
+    found = run(kind, np.zeros((11, 11)), position, orientation)
+    assert not found["active"][:, :3].any() and found["active"][0, 3]
+    assert all(np.isfinite(value).all() for value in found.values())
+    assert (found["separation"][:, :3] > 1e3 * reach).all()
+
+
+# ---- features ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "cone", "polyhedron", "capsule"])
+def test_peak_under_a_face(kind, float64):
+    """A thin spike holds a body that lies over it; nothing else of the body is near the ground."""
+    heights = np.zeros((11, 11))
+    heights[5, 5] = 0.4
+    low = {"box": -0.15, "cylinder": -0.2, "cone": -0.1, "capsule": -0.15}.get(kind)
+    turn = Rotation.identity()
+    if kind == "polyhedron":
+        first, second, third = STONE[list(STONE_FACES[0][:3])]
+        outward = np.cross(second - first, third - first)
+        outward /= np.linalg.norm(outward)
+        turn = Rotation.align_vectors([[0.0, -1.0, 0.0]], [outward])[0]
+        middle = turn.apply((first + second + third) / 3.0)
+        offset, low = np.array([-middle[0], 0.0, -middle[2]]), middle[1]
+    else:
+        offset = np.array([0.02, 0.0, 0.03])
+    if kind == "capsule":
+        turn, offset = Rotation.from_rotvec([np.pi / 2, 0, 0]), np.array([0.0, 0.0, 0.03])
+    for depth in (-0.01, 0.02):
+        position = offset + np.array([0.0, 0.4 - low - depth, 0.0])
+        found = run(kind, heights, position, turn.as_quat()[[3, 0, 1, 2]])
+        np.testing.assert_allclose(found["separation"][0], -depth, atol=1e-12)
+        np.testing.assert_allclose(found["normal"][0, 0], [0.0, -1.0, 0.0], atol=1e-12)
+        np.testing.assert_allclose(found["position"][0, 0], [0.0, 0.4 - 0.5 * depth, 0.0], atol=1e-12)
+
+
+def test_ridge_across_an_edge(float64):
+    """The edge of a tilted box lies across a ridge along x: closed form of two crossing lines."""
+    heights = np.tile(0.5 - np.abs(np.arange(11) - 5.0) * 0.2, (11, 1))
+    half = SIZES["box"]["half_extents"]
+    turn = Rotation.from_euler("z", 45.0, degrees=True)
+    drop = (half[0] + half[1]) / np.sqrt(2.0)
+    shift = (half[0] - half[1]) / np.sqrt(2.0)
+    # Found where the lower edge along z crosses; in x in the middle of a cell, away from grid points.
+    for gap in (0.03, -0.01):
+        position = np.array([0.11 - shift, 0.5 + drop + gap, 0.07])
+        lowest = position + turn.apply(np.array([[-1, -1, 0], [1, -1, 0]]) * half)
+        lowest = lowest[lowest[:, 1].argmin()]
+        found = run("box", heights, position, turn.as_quat()[[3, 0, 1, 2]])
+        np.testing.assert_allclose(found["separation"][0], gap, atol=1e-12)
+        np.testing.assert_allclose(found["normal"][0, 0], [0.0, -1.0, 0.0], atol=1e-12)
+        np.testing.assert_allclose(found["position"][0, 0], [lowest[0], 0.5 + 0.5 * gap, 0.0], atol=1e-12)
+
+
+def test_rotated_and_moved_field(float64):
+    """Contacts move with the pose of the field."""
+    position, orientation = over_the_hills("box", 20, 14)
+    found = run("box", HILLS, position, orientation)
+    turn, shift = Rotation.from_rotvec([0.4, -0.3, 0.9]), np.array([3.0, -2.0, 1.0])
+    moved = turn.apply(position) + shift
+    turned = (turn * Rotation.from_quat(orientation[:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+    again = run("box", HILLS, moved, turned, (shift, turn.as_quat()[[3, 0, 1, 2]]))
+    used = found["active"]
+    np.testing.assert_array_equal(used, again["active"])
+    np.testing.assert_allclose(again["separation"][0], found["separation"][0], atol=1e-9)
+    np.testing.assert_allclose(again["normal"][0], turn.apply(found["normal"][0]), atol=1e-9)
+
+
+# ---- scenes and queries ------------------------------------------------------------------------------------------
+
+
+def simulate(shape, ground, seconds, dt=0.005, **body):
+    builder = SceneBuilder()
+    builder.add_body(ground, static=True, friction=0.8, name="ground")
+    builder.add_body(shape, mass=1.0, friction=0.8, name="body", **body)
+    model, state = builder.build(Options(dt=dt))
+
+    def turn(state, _):
+        state = step(model, state)
+        return state, (state.position[1], state.velocity[1], state.angular_velocity[1])
+
+    return jax.tree.map(np.asarray, jax.jit(lambda s: jax.lax.scan(turn, s, None, length=round(seconds / dt)))(state))
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3], ids=["flat", "inclined"])
+def test_box_rests_and_slides_as_on_a_plane(slope, float64, gate):
+    along = (np.arange(13) - 6.0) * CELL
+    ground = Heightfield(np.tile(slope * along[:, None], (1, 13)), CELL)
+    box = Box((0.3, 0.15, 0.25))
+    angle = np.arctan(slope)
+    pose = {
+        "position": np.array([-np.sin(angle), np.cos(angle), 0.0]) * 0.15,
+        "orientation": Rotation.from_rotvec([0, 0, angle]).as_quat()[[3, 0, 1, 2]],
+        "velocity": (0.5 * np.cos(angle), 0.5 * np.sin(angle), 0.2),
+    }
+    _, ours = simulate(box, ground, 1.0, **pose)
+    _, truth = simulate(box, Plane((-slope, 1.0, 0.0)), 1.0, **pose)
+    gate("position", ours[0] - truth[0], 1e-6)
+    gate("angular velocity", ours[2] - truth[2], 1e-4)
+    assert np.abs(truth[1][-1]).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["capsule", "hull", "box"])
+def test_bodies_come_to_rest_on_hills(name):
+    shape = {"capsule": Capsule(0.12, 0.3), "hull": Polyhedron(STONE), "box": Box((0.3, 0.15, 0.25))}[name]
+    heights = np.random.default_rng(0).normal(size=(17, 17)) * 0.12
+    start = {"position": (0.05, 0.8, -0.1), "angular_velocity": (1.0, 0.5, 2.0)}
+    _, (position, velocity, _) = simulate(shape, Heightfield(heights, CELL), 5.0, **start)
+    assert np.isfinite(position).all()
+    above = position[:, 1] - surface(heights, position)
+    assert above.min() > 0.0, "the centre fell into the ground"
+    speed = np.linalg.norm(velocity[-100:], axis=1).max()
+    assert speed < (1.0 if name == "capsule" else 1e-3)  # a capsule has nothing that stops it from rolling
+
+
+def test_sphere_rolls_in_a_bowl(gate):
+    """The centre comes back to the height it started from, but for what the facets take."""
+    points = (np.arange(41) - 20.0) * 0.1
+    ground = Heightfield(0.15 * (points[:, None] ** 2 + points**2), 0.1)
+    _, (position, velocity, spin) = simulate(Sphere(0.3), ground, 5.0, position=(1.2, 0.15 * 1.44 + 0.31, 0.05))
+    energy = 9.81 * position[:, 1] + 0.5 * (velocity**2).sum(1) + 0.5 * 0.4 * 0.3**2 * (spin**2).sum(1)
+    assert position[:, 0].min() < -0.3 and np.abs(position).max() < 1.3
+    gate("energy gained", np.maximum(energy - energy[0], 0.0) / energy[0], 1e-3)
+    assert (position[:, 1] > 0.29).all()
+
+
+def test_queries_with_heightfields(float64, gate):
+    ground, sphere = Heightfield(HILLS, CELL), Sphere(0.3)
+    position = np.array([0.1, 0.6, -0.2])
+    found = signed_distance(ground, (np.zeros(3), UPRIGHT), sphere, (position, UPRIGHT))
+    nearest, distance = nearest_on_triangles(position[None, None], triangles(HILLS))
+    gate("separation", found.separation - distance.min() + 0.3, 1e-12)
+    gate("point on the ground", found.point_a - nearest[0, distance.argmin()], 1e-12)
+    contacts = manifold(sphere, (position, UPRIGHT), ground, (np.zeros(3), UPRIGHT))
+    gate("normals", jnp.linalg.norm(contacts.normals, axis=1) - 1.0, 1e-12)
+
+    def gap(radius, window):
+        ball = dataclasses.replace(Geometry.of(sphere), parameters={"radius": radius})
+        field = dataclasses.replace(Geometry.of(ground), window=window)
+        return signed_distance(ball, (position, UPRIGHT), field, (np.zeros(3), UPRIGHT)).separation
+
+    gate("by the radius", jax.grad(gap)(jnp.array(0.3), 4) + 1.0, 1e-12)
+    with pytest.raises(ValueError, match="window"):
+        jax.grad(gap)(jnp.array(0.3), None)
+
+
+def test_window_follows_from_body_and_cells():
+    builder = SceneBuilder()
+    builder.add_body(Heightfield(np.zeros((9, 9)), 0.5), static=True)
+    builder.add_body(Sphere(0.3), mass=1.0, position=(0, 1, 0))
+    builder.add_body(Sphere(0.6), mass=1.0, position=(0, 3, 0))
+    groups = {group.kind_b: group for group in builder.build()[0].scene.pair_groups}
+    assert groups["heightfield"].window == window_size(0.6, 0.5) == 4
