@@ -22,7 +22,7 @@ from mathota_jax.model import Model
 from mathota_jax.options import Options
 from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate, rotate_back
 from mathota_jax.scene import JointEntry, PairGroup, Scene, ShapeEntry
-from mathota_jax.shape_table import ShapeTable, shape_table
+from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
 from mathota_jax.state import State
 
 
@@ -215,7 +215,7 @@ class SceneBuilder:
             sorted(joined),
             options,
         )
-        groups = self._pair_groups(table.entries, frozenset(broadphase.shapes) if broadphase else frozenset())
+        groups = self._pair_groups(table, frozenset(broadphase.shapes) if broadphase else frozenset())
         pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
         if broadphase:
             # Any two that take part may meet: it is enough that one moving body and another one have the property.
@@ -288,15 +288,15 @@ class SceneBuilder:
             contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
         )
 
-    def _pair_groups(self, shapes: tuple[ShapeEntry, ...], planned: frozenset[int]) -> tuple[PairGroup, ...]:
+    def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:
         """Admissible pairs: not both static, not joined by a joint, both colliding, not both `planned` (broadphase)."""
         joined = {frozenset((joint.parent, joint.child)) for joint in self._joints}
         order = list(SHAPES)
         members: dict[tuple[str, str], list[tuple[ShapeEntry, ShapeEntry]]] = {}
-        others = [entry for k, entry in enumerate(shapes) if k not in planned]
-        pairs = itertools.combinations(shapes, 2)
+        others = [entry for k, entry in enumerate(table.entries) if k not in planned]
+        pairs = itertools.combinations(table.entries, 2)
         if planned:
-            found = [shapes[k] for k in sorted(planned)]
+            found = [table.entries[k] for k in sorted(planned)]
             pairs = itertools.chain(itertools.combinations(others, 2), itertools.product(others, found))
         for first, second in pairs:
             one, two = self._bodies[first.body], self._bodies[second.body]
@@ -320,6 +320,7 @@ class SceneBuilder:
                 tuple(b.index for _, b in pairs),
                 tuple(a.body for a, _ in pairs),
                 tuple(b.body for _, b in pairs),
+                heightfield_window(table, pairs) if kind_b == "heightfield" else None,
             )
             for (kind_a, kind_b), pairs in sorted(
                 members.items(), key=lambda item: (order.index(item[0][0]), order.index(item[0][1]))

@@ -6,6 +6,7 @@ are pure, differentiable, and fast under `jax.vmap` (the mapped pairs run side b
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.batching import batch_last
+from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.geometry import SHAPES, Shape
@@ -50,10 +52,11 @@ class Distance(NamedTuple):
 
 
 class ContactManifold(NamedTuple):
-    """Contact points of two shapes, with their common unit `normal` (3,) from A to B.
+    """Contact points of two shapes, with unit normals from A to B.
 
     Attributes:
-      normal: (3,) world frame.
+      normal: (3,) of the first, deepest point and, but for heightfields, of all; world frame.
+      normals: (point, 3) of each point, world frame.
       position: (point, 3) midway between the surfaces [m], world frame.
       separation: (point,) signed gaps along the normal [m].
       feature: (point,) id of the geometric feature, stable under small motions.
@@ -61,6 +64,7 @@ class ContactManifold(NamedTuple):
     """
 
     normal: Array
+    normals: Array
     position: Array
     separation: Array
     feature: Array
@@ -160,7 +164,23 @@ def _pair(label: str, shape_a: Any, shape_b: Any) -> tuple[Geometry, Geometry]:
         raise ValueError(f"{label}: {error}") from None
     if _key(a, b) not in PAIRS:
         raise ValueError(f"{label}: there is no distance between a {a.kind} and a {b.kind}")
-    return a, b
+    if a.kind == "heightfield":
+        return _windowed(label, a, b), b
+    return a, _windowed(label, b, a) if b.kind == "heightfield" else b
+
+
+def _windowed(label: str, field: Geometry, other: Geometry) -> Geometry:
+    """The heightfield with the size of the window of its cells that are tested."""
+    if field.window is not None:
+        return field
+    sizes = [field.parameters["cell_size"], *other.parameters.values()]
+    if any(isinstance(size, jax.core.Tracer) for size in sizes):
+        raise ValueError(
+            f"{label}: the sizes of a {other.kind} and the cells of a heightfield are traced, so how many cells lie under "
+            "the shape is unknown; give the number along each side: dataclasses.replace(geometry, window=...)"
+        )
+    reach = float(SHAPES[other.kind].reach_of({name: np.asarray(v) for name, v in other.parameters.items()}))
+    return dataclasses.replace(field, window=window_size(reach, float(field.parameters["cell_size"])))
 
 
 def _check_poses(label: str, *poses: NaturalPose) -> None:
@@ -184,7 +204,12 @@ def _run_pair(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> Manifold:
     swapped = key != (a.kind, b.kind)
     first, second = ((b, pose_b), (a, pose_a)) if swapped else ((a, pose_a), (b, pose_b))
     found = PAIRS[key].function(*_placed(*first), *_placed(*second))
-    return found._replace(normal=-found.normal) if swapped else found
+    return _reversed(found) if swapped else found
+
+
+def _reversed(found: Manifold) -> Manifold:
+    points = (p if p.normal is None else p._replace(normal=-p.normal) for p in found.points)
+    return Manifold(-found.normal, tuple(points))
 
 
 def _placed(geometry: Geometry, pose: Pose) -> tuple[dict[str, Any], Pose]:
@@ -209,6 +234,8 @@ def _sizes(geometry: Geometry) -> dict[str, Any]:
             found[name] = Vec3(*(value[axis][None] for axis in range(3))) if value.ndim == 2 else value[None]
     if geometry.faces is not None:
         found["faces"] = padded_faces([geometry.faces])
+    if geometry.window is not None:
+        found["window"] = geometry.window
     return found
 
 
@@ -235,13 +262,14 @@ def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> _Nearest:
     """The deepest active point of the manifold, components (1, world)."""
     found = _run_pair(a, pose_a, b, pose_b)
     first, *others = found.points
-    position, separation = first.position, first.separation
+    position, separation, normal = first.position, first.separation, found.normal
     for point in others:
         nearer = settle(jnp.where(point.active & (point.separation < separation), 1.0, 0.0)) > 0.5
         position, separation = where(nearer, point.position, position), jnp.where(nearer, point.separation, separation)
-    half = found.normal * (0.5 * separation)
+        normal = normal if point.normal is None else where(nearer, point.normal, normal)
+    half = normal * (0.5 * separation)
     converged = jnp.ones(jnp.shape(separation), bool) if found.converged is None else found.converged
-    return _Nearest(separation, found.normal, position - half, position + half, converged)
+    return _Nearest(separation, normal, position - half, position + half, converged)
 
 
 def _natural(nearest: _Nearest) -> Distance:
@@ -273,6 +301,7 @@ def _manifold(a: Geometry, b: Geometry, pose_a: NaturalPose, pose_b: NaturalPose
 
     return ContactManifold(
         normal=vector(found.normal),
+        normals=jnp.stack([vector(found.normal if p.normal is None else p.normal) for p in found.points]),
         position=jnp.stack([vector(point.position) for point in found.points]),
         separation=jnp.stack([full(point.separation) for point in found.points]),
         feature=jnp.stack([full(point.feature) for point in found.points]),

@@ -21,6 +21,7 @@ class PairGroup(NamedTuple):
     """All admissible pairs of two shape kinds, tested by one vectorised call.
 
     `shapes_a`/`shapes_b` are rows of the parameters of each kind, `bodies_a`/`bodies_b` the bodies they are fixed to.
+    `window` is how many cells of a heightfield along each side are tested around a body, None for other kinds.
     """
 
     kind_a: str
@@ -30,6 +31,7 @@ class PairGroup(NamedTuple):
     shapes_b: tuple[int, ...]
     bodies_a: tuple[int, ...]
     bodies_b: tuple[int, ...]
+    window: int | None = None
 
     @property
     def slot_count(self) -> int:

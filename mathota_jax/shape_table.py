@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mathota_jax.collision.height_grid import window_size
 from mathota_jax.declarations import UNTURNED, Body
-from mathota_jax.geometry import Compound, Heightfield, Plane, Polyhedron, Sphere
+from mathota_jax.geometry import SHAPES, Compound, Heightfield, Plane, Polyhedron, Sphere
 from mathota_jax.geometry.compound import Part
 from mathota_jax.geometry.hull import Faces
 from mathota_jax.rotation import rotate
@@ -83,6 +84,17 @@ def _stacked(rows: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 def _padded(vertices: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([vertices, np.repeat(vertices[:1], count - len(vertices), axis=0)])
+
+
+def heightfield_window(table: ShapeTable, pairs: Sequence[tuple[ShapeEntry, ShapeEntry]]) -> int:
+    """Cells along each side of the window that suits every pair of a shape with a heightfield."""
+    cell_sizes = table.parameters["heightfield"]["cell_size"]
+
+    def size(entry: ShapeEntry, field: ShapeEntry) -> int:
+        row = {name: value[entry.index] for name, value in table.parameters[entry.kind].items()}
+        return window_size(float(SHAPES[entry.kind].reach_of(row)), float(cell_sizes[field.index]))
+
+    return max(size(entry, field) for entry, field in pairs)
 
 
 def _check_grids(bodies: Sequence[Body]) -> None:

@@ -17,16 +17,18 @@ class ContactPoint(NamedTuple):
         separation: Signed gap [m] along the normal, negative when overlapping; always finite.
         feature: int32 id of the geometric feature, stable from step to step within a pair.
         active: bool, False where this slot holds no contact (its other fields are finite and meaningless).
+        normal: Unit vector from A to B where the points of a manifold have normals of their own (heightfields), else None.
     """
 
     position: Vec3
     separation: Array
     feature: Array
     active: Array
+    normal: Vec3 | None = None
 
 
 class Manifold(NamedTuple):
-    """Contact points of a pair that share one unit `normal` from A to B, in the world frame.
+    """Contact points of a pair and their unit `normal` from A to B, in the world frame; see `ContactPoint.normal`.
 
     `converged` is bool, shape ``(pair, world)``, False where an iterative search ended at its limit with the best bound
     found; None for methods that always end.

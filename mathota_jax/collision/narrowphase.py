@@ -63,10 +63,13 @@ def _concatenate(values: list[Any], worlds: int) -> Any:
 def _group_contacts(
     scene: Scene, group: PairGroup, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
 ) -> ContactSet:
+    parameters_b = shape_parameters(scene, shapes, group.kind_b, group.shapes_b)
+    if group.window is not None:
+        parameters_b["window"] = group.window
     manifold = PAIRS[group.kind_a, group.kind_b].function(
         shape_parameters(scene, shapes, group.kind_a, group.shapes_a),
         shape_poses(shapes, group.kind_a, group.shapes_a, group.bodies_a, position, orientation),
-        shape_parameters(scene, shapes, group.kind_b, group.shapes_b),
+        parameters_b,
         shape_poses(shapes, group.kind_b, group.shapes_b, group.bodies_b, position, orientation),
     )
     return flatten(manifold, len(group.bodies_a))
@@ -89,10 +92,13 @@ def flatten(manifold: Manifold, pair_count: int) -> ContactSet:
         full = jnp.broadcast_to(value[:, None], (pair_count, len(points), value.shape[-1]))
         return full.reshape(pair_count * len(points), value.shape[-1])
 
-    position = Vec3(*(per_point([point.position[axis] for point in points]) for axis in range(3)))
+    def per_axis(vectors: list[Vec3]) -> Vec3:
+        return Vec3(*(per_point([vector[axis] for vector in vectors]) for axis in range(3)))
+
+    own = [point.normal for point in points if point.normal is not None]
     return ContactSet(
-        position,
-        manifold.normal.map(per_pair),
+        per_axis([point.position for point in points]),
+        per_axis(own) if own else manifold.normal.map(per_pair),
         per_point([point.separation for point in points]),
         per_point([point.feature for point in points]),
         per_point([point.active for point in points]),

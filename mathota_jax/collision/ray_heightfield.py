@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.collision.height_grid import gather_heights
 from mathota_jax.collision.ray_frame import PARALLEL, LocalRay, RayHit, far, hit_at, local_ray, slab
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import settle
@@ -132,7 +133,7 @@ def _plane(heights: Array, row: Array, column: Array, upper: Array) -> tuple[Arr
     """Height [m] at the cell's first corner and rise per row and per column of one of its two triangles."""
 
     def at(down: Any, right: Any) -> Array:
-        return _gather(heights, row + down, column + right)
+        return gather_heights(heights, row + down, column + right)
 
     corner, opposite = at(0, 0), at(1, 1)
     third = at(1 - upper, upper)
@@ -140,16 +141,3 @@ def _plane(heights: Array, row: Array, column: Array, upper: Array) -> tuple[Arr
     slope_u = jnp.where(is_upper, opposite - third, third - corner)
     slope_v = jnp.where(is_upper, third - corner, opposite - third)
     return corner, slope_u, slope_v
-
-
-def _gather(heights: Array, row: Array, column: Array) -> Array:
-    """Heights (shape, world) at the grid points of the given indices, which are held within the grid."""
-    rows, columns = heights.shape[:2]
-    index = jnp.clip(row, 0, rows - 1) * columns + jnp.clip(column, 0, columns - 1)
-    flat = heights.reshape(rows * columns, *heights.shape[2:])
-    shape = jnp.broadcast_shapes(index.shape, flat.shape[1:])
-    if flat.shape[1:] == (1, 1):
-        return flat[:, 0, 0][index]
-    element, world = jnp.indices(shape, sparse=True)
-    index = jnp.broadcast_to(index, shape)
-    return flat[index, jnp.minimum(element, flat.shape[1] - 1), jnp.minimum(world, flat.shape[2] - 1)]

@@ -22,11 +22,14 @@ class Geometry:
       parameters: sizes by name in natural shapes [m], e.g. "radius" (), "half_extents" (3,), "vertices" (vertex, 3).
       kind: key of `SHAPES`.
       faces: of a polyhedron, the vertex indices of each face, counter-clockwise seen from outside.
+      window: of a heightfield, how many cells along each side are tested around the other shape. None: enough for its
+        sizes, which then must not be traced.
     """
 
     parameters: dict[str, Array]
     kind: str = static()
     faces: tuple[tuple[int, ...], ...] | None = static(default=None)
+    window: int | None = static(default=None)
 
     @classmethod
     def of(cls, shape: Any) -> Geometry:

@@ -1,0 +1,320 @@
+"""Convex shapes against a heightfield: contacts of faces, ridges and peaks of the ground under the body.
+
+The ground is not convex; near each contact it is. A contact is a local extremum: a direction ``up`` in which the body
+is parted best from a face, a ridge or a peak, where `up` belongs to the normals of that feature (the face's normal, the
+arc between the normals of the two faces of a ridge, the cone between those around a peak). So an edge inside of flat
+ground has no contact of its own, and no ghost normal.
+
+- Faces: the point of the body that is extreme against the face's normal.
+- Ridges: a search along the arc of normals by bisection; only the support function of the body is needed.
+- Peaks: the closed-form distance of a point from the body.
+- The points on which the body would stand on a plane, each against the triangle under it: they span the base.
+
+The deepest of all these and up to three that differ most from it are kept.
+
+Source: the Gauss map of features, as in D. Gregorius, "The Separating Axis Test between Convex Polyhedra" (GDC 2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_lean, pick
+from mathota_jax.collision.convex.support import SUPPORT
+from mathota_jax.collision.height_grid import (
+    Window,
+    grid_window,
+    ground_at,
+    height_over,
+    listed,
+    margin,
+    peak_cones,
+    triangles,
+)
+from mathota_jax.collision.heightfield_ridges import ridge_contacts
+from mathota_jax.collision.manifold import ContactPoint, Manifold
+from mathota_jax.geometry.bounds import bounding_radius
+from mathota_jax.spatial.pose import Pose
+from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm, where
+
+SEAM = 1e-5
+"""Triangles overlap by this share of a cell, so that no point falls between them."""
+FLAT = 1e-5
+"""A grid point must stand out of its neighbours' plane by this share of a cell to be a peak."""
+MERGE = 1e-3
+"""Contacts closer than this share of the body's size, normals included, are one."""
+HEIGHT_WEIGHT = 10.0
+"""A contact higher than the deepest one must widen the base by this many times the height (see `plane_polyhedron`)."""
+ABSENT = 1e6
+"""Separation, in units of the body's size, where there is no ground."""
+
+
+class Kind(NamedTuple):
+    """What is known of a convex kind.
+
+    Attributes:
+        name: Key of `SUPPORT`.
+        point_distance: Pair function of a sphere with the kind.
+        flat_contacts: Pair function of a plane with the kind; None for the kinds that are an inflated core, whose ends
+            are tested against every face.
+    """
+
+    name: str
+    point_distance: Callable[..., Manifold]
+    flat_contacts: Callable[..., Manifold] | None = None
+
+
+class Candidates(NamedTuple):
+    """Possible contacts, components (candidate, pair, world), in the frame of the field from the body's centre on.
+
+    `ground` is the point on the ground, `up` the unit normal out of it.
+    """
+
+    ground: Vec3
+    up: Vec3
+    separation: Array
+    feature: Array
+    valid: Array
+
+
+def heightfield_contacts(known: Kind, a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
+    """Up to four contacts of a convex shape with a heightfield, the deepest first.
+
+    Every point has its own normal; that of the manifold is the deepest one's. Where there is no ground under the body no
+    point is active.
+
+    Args:
+        known: Kind of A.
+        a: Parameters of A.
+        pose_a: Pose of A; a sphere needs no rotation.
+        b: "heights" (row, column, pair, world), "cell_size" (pair, world) and "window", an int: how many cells along
+            each side are tested (see `window_size`).
+        pose_b: Pose of the heightfield.
+    """
+    kind = known.name
+    assert pose_b.rotation is not None
+    center = pose_b.point_to_local(pose_a.position)
+    rotation = _relative(pose_a.rotation, pose_b.rotation, center)
+    center, rotation = compute_once((center, rotation), center.x)
+    window = grid_window(b, center, b["window"])
+    size = lax.stop_gradient(bounding_radius(kind, a)) + jnp.zeros_like(center.x)
+
+    found = [
+        *_face_contacts(kind, a, rotation, window),
+        _ridges(kind, a, rotation, window),
+        _peaks(known, a, rotation, window),
+    ]
+    if known.flat_contacts is not None:
+        found.append(_base(known.flat_contacts, a, rotation, window, _joined(found), size))
+    candidates = _joined(found)
+    base_count = 0 if known.flat_contacts is None else found[-1].separation.shape[0]
+    chosen = _reduced(candidates, size, base_count)
+    return _manifold(candidates, chosen, size, pose_a, pose_b)
+
+
+def _relative(rotation_a: Mat3 | None, rotation_b: Mat3, like: Vec3) -> Mat3:
+    """Field from body; a sphere is never turned."""
+    if rotation_a is None:
+        one, zero = jnp.ones_like(like.x), jnp.zeros_like(like.x)
+        return Mat3(Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one))
+    return Mat3(*(rotation_b.apply_transposed(column) for column in rotation_a))
+
+
+def _inflation(kind: str, a: dict[str, Any]) -> Any:
+    inflation = SUPPORT[kind].inflation
+    return 0.0 if inflation is None else inflation(a)
+
+
+def _face_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window) -> list[Candidates]:
+    """Core points of the body against the triangles they are over (or, inside the ground, under)."""
+    faces = triangles(window)
+    if kind == "sphere":
+        zero = jnp.zeros_like(faces.normal.x)
+        cores = [Vec3(zero, zero, zero)]
+    elif kind == "capsule":
+        half = rotation.column_y * a["half_height"]
+        cores = [-half, half]
+    else:
+        local = rotation.apply_transposed(-faces.normal)
+        code = SUPPORT[kind].code(*lax.stop_gradient((a, local)))
+        cores = [rotation.apply(SUPPORT[kind].point(a, code, local))]
+    cell = window.field["cell_size"]
+    found = []
+    for index, core in enumerate(cores):
+        height = height_over(faces.normal, faces.corner, core)
+        foot = core - faces.normal * height
+        frozen = lax.stop_gradient((core, foot, height, faces.normal, faces.corner, cell))
+        valid = settle(_over_face(window, *frozen, faces.is_upper).astype(height.dtype)) > 0.5
+        feature = 2 * faces.number + index
+        found.append(Candidates(foot, faces.normal, height - _inflation(kind, a), feature, valid))
+    return found
+
+
+def _over_face(
+    window: Window, core: Vec3, foot: Vec3, height: Array, normal: Vec3, corner: Vec3, cell: Any, is_upper: Any
+) -> Array:
+    """Whether a point leaves the ground through a triangle (or has it as its nearest)."""
+    foot_inside = margin(foot, corner, is_upper, cell) >= -SEAM
+    column_inside = margin(core, corner, is_upper, cell) >= -SEAM
+    ground = lax.stop_gradient(ground_at(window, core))
+    # Inside a ridge the plane beyond the crest is above the ground over the point; only in a valley it is below.
+    over = height_over(ground.normal, ground.corner, core) / ground.normal.y
+    valley = ground.exists & (height / normal.y >= over - SEAM * cell)
+    return jnp.where(height >= 0, foot_inside, column_inside | (foot_inside & valley))
+
+
+def _ridges(kind: str, a: dict[str, Any], rotation: Mat3, window: Window) -> Candidates:
+    ridge = ridge_contacts(kind, a, rotation, window)
+    offset = 4 * _grid_count(window)
+    return Candidates(
+        ridge.ground, ridge.up, ridge.separation - _inflation(kind, a), offset + ridge.number, ridge.valid
+    )
+
+
+def _grid_count(window: Window) -> int:
+    rows, columns = window.field["heights"].shape[:2]
+    return rows * columns
+
+
+def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window) -> Candidates:
+    """Grid points against the body, where the direction looks out of the ground."""
+    ways, complete, number = peak_cones(window)
+    points = window.points.map(listed)
+    zero = jnp.zeros_like(points.x[0])
+    body = Pose(Vec3(zero, zero, zero), rotation)
+
+    def distance(point: Vec3) -> tuple[Vec3, Array]:
+        found = known.point_distance({"radius": jnp.zeros((1, 1), zero.dtype)}, Pose(point), a, body)
+        return found.normal, found.points[0].separation
+
+    up, separation = jax.vmap(distance)(points)
+    direction = lax.stop_gradient(up)
+    cell = lax.stop_gradient(window.field["cell_size"])
+    valid = complete & (direction.y > 0)
+    for way, present in ways:
+        valid &= ~present | (dot(direction, lax.stop_gradient(way)) < -FLAT * cell)
+    valid = settle(valid.astype(separation.dtype)) > 0.5
+    return Candidates(points, up, separation, 7 * _grid_count(window) + number, valid)
+
+
+def _base(
+    flat_contacts: Callable[..., Manifold],
+    a: dict[str, Any],
+    rotation: Mat3,
+    window: Window,
+    others: Candidates,
+    size: Array,
+) -> Candidates:
+    """The points on which the body would stand on the plane of the deepest contact, each against its own ground."""
+    lowest = jnp.finfo(size.dtype).min
+    score, code = best_candidate(jnp.where(others.valid, -others.separation, lowest))
+    up = pick(others.up, code)
+    none = score <= lowest
+    up = where(none, Vec3(0.0, 1.0, 0.0), up)
+    zero = jnp.zeros_like(size)
+    flat = flat_contacts(
+        {"normal": up, "offset": zero}, Pose(Vec3(zero, zero, zero)), a, Pose(Vec3(zero, zero, zero), rotation)
+    )
+
+    def stacked(values: list[Array]) -> Array:
+        return jnp.stack([jnp.broadcast_to(value, zero.shape) for value in values])
+
+    half = [point.position + up * (0.5 * point.separation) for point in flat.points]
+    corner = Vec3(*(stacked([point[axis] for point in half]) for axis in range(3)))
+    feature, active = (stacked([getattr(p, name) for p in flat.points]) for name in ("feature", "active"))
+
+    cell = window.field["cell_size"]
+    below = ground_at(window, corner)
+    height = height_over(below.normal, below.corner, corner)
+    # A corner in the air has its nearest point where the perpendicular, not the plumb line, meets the ground.
+    raised = settle((height > 0).astype(height.dtype)) > 0.5
+    foot = corner - below.normal * jnp.where(raised, height, 0.0)
+    beside = ground_at(window, lax.stop_gradient(foot))
+    height = height_over(beside.normal, beside.corner, corner)
+    foot = corner - beside.normal * height
+    inside = margin(*lax.stop_gradient((foot, beside.corner)), beside.is_upper, lax.stop_gradient(cell)) >= -SEAM
+    valid = settle((below.exists & beside.exists & active & (inside | ~raised)).astype(height.dtype)) > 0.5
+    return Candidates(foot, beside.normal, height, 8 * _grid_count(window) + feature, valid)
+
+
+def _joined(parts: list[Candidates]) -> Candidates:
+    shape = jnp.broadcast_shapes(*(leaf.shape[1:] for leaf in jax.tree.leaves(parts)))
+
+    def join(*values: Array) -> Array:
+        counts = [part.separation.shape[0] for part in parts]
+        full = [jnp.broadcast_to(value, (count, *shape)) for value, count in zip(values, counts, strict=True)]
+        return jnp.concatenate(full)
+
+    return jax.tree.map(join, *parts)
+
+
+def _reduced(candidates: Candidates, size: Array, base_count: int) -> tuple[Array, ...]:
+    """Settled numbers of up to four candidates, -1 for none; the deepest first.
+
+    The farthest from it, the farthest from the line through both and the one that adds most to the triangle follow
+    (guide 7.2). A different normal counts as a distance: in a valley two contacts of one point are two.
+    """
+    ground, up, separation, _, valid = lax.stop_gradient(candidates)
+    ground, up, separation = compute_once((ground, up, separation), separation)
+    number = separation.dtype
+    lowest = jnp.finfo(number).min
+    share = depth_lean(number)
+    lean = dot(LEAN, ground)
+    score = share * lean - separation
+    if base_count:
+        # The points of the base keep their ids from cell to cell; where others are equally deep these are taken.
+        is_base = (jnp.arange(score.shape[0]) >= score.shape[0] - base_count).reshape(-1, 1, 1)
+        score = score + jnp.where(is_base, 8.0 * share * size, 0.0)
+    best, first = best_candidate(jnp.where(valid, score, lowest))
+    first = jnp.where(best > lowest, first, -1)
+    ground0, up0, depth0 = pick((ground, up, separation), first)
+    penalty = HEIGHT_WEIGHT * jnp.maximum(separation - depth0, 0.0) - LEAN_SHARE * lean
+
+    def winner(widening: Array, usable: Array) -> Array:
+        distinct = (widening > MERGE * size) & usable & valid
+        score, code = best_candidate(jnp.where(distinct, widening - penalty, lowest))
+        return jnp.where(score > lowest, code, -1)
+
+    offset = ground - ground0
+    turn = size * norm(up - up0)
+    second = winner(norm(offset) + turn, first >= 0)
+    side, up1 = pick((offset, up), second)
+    beyond = _beyond(offset, side, up0)
+    turn = jnp.minimum(turn, size * norm(up - up1))
+    third = winner(jnp.abs(beyond) + turn, second >= 0)
+    other_side, up2 = pick((offset, up), third)
+    turn = jnp.minimum(turn, size * norm(up - up2))
+    left = jnp.where(dot(cross(side, other_side), up0) > 0, -1.0, 1.0).astype(number)
+    outside = jnp.maximum(
+        left * beyond,
+        jnp.maximum(left * _beyond(offset - side, other_side - side, up0), -left * _beyond(offset, other_side, up0)),
+    )
+    return first, second, third, winner(jnp.maximum(outside, 0.0) + turn, third >= 0)
+
+
+def _beyond(offset: Vec3, side: Vec3, up: Vec3) -> Array:
+    """Distance from the line along `side`, seen along `up`, positive to its left; from its start where it is a point."""
+    length = norm(side)
+    safe = jnp.where(length > 0, length, 1.0)
+    return jnp.where(length > 0, dot(cross(side, offset), up) / safe, norm(offset))
+
+
+def _manifold(candidates: Candidates, chosen: tuple[Array, ...], size: Array, pose_a: Pose, pose_b: Pose) -> Manifold:
+    assert pose_b.rotation is not None
+    points = []
+    for code in chosen:
+        ground, up, separation, feature, _ = pick(candidates._replace(valid=candidates.feature), code)
+        active = code >= 0
+        up = where(active, up, Vec3(0.0, 1.0, 0.0))
+        separation = jnp.where(active, separation, ABSENT * size)
+        middle = ground + up * jnp.where(active, 0.5 * separation, 0.0)
+        position = pose_a.position + pose_b.rotation.apply(middle)
+        normal = -pose_b.rotation.apply(up)
+        points.append(ContactPoint(position, separation, feature, active, normal))
+    return Manifold(points[0].normal, tuple(points))

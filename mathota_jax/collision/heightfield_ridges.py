@@ -1,0 +1,129 @@
+"""Ridges of a heightfield against a convex body: the best separating direction on the arc of a ridge's normals."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.collision.closest import clamp
+from mathota_jax.collision.convex.support import SUPPORT
+from mathota_jax.collision.height_grid import Edges, Window, edges
+from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import settle, settle_code
+from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm, normalize, where
+
+BISECTIONS = 16
+"""Halvings of the arc; a Newton step makes the direction exact."""
+CONVEX = 1e-5
+"""Sine of the bend from which an edge is a ridge."""
+BEYOND = 0.05
+"""The arc is searched beyond its ends by this share: a body that lies on one slope and juts out over the ridge has its
+best direction exactly at the end."""
+LARGEST_CORRECTION = 1e-2
+"""The Newton step [rad] is held to this; only where the body's corner touches the ridge itself is it without bound."""
+
+
+class Ridges(NamedTuple):
+    """Contacts of ridges, components (edge, pair, world); see `heightfield.Candidates`. The separation is the core's."""
+
+    ground: Vec3
+    up: Vec3
+    separation: Array
+    number: Array
+    valid: Array
+
+
+class _Extreme(NamedTuple):
+    """Direction on the arc where the parting is best, and the pieces of the body that are extreme on either side."""
+
+    up: Vec3
+    piece_minus: Array
+    piece_plus: Array
+    interior: Array
+
+
+def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window) -> Ridges:
+    """Contacts with all edges of the window that are ridges.
+
+    The parting ``g(up) = min over the body of up . (x - ridge)`` has the derivative ``(along x up) . (x - ridge)``; at
+    its maximum on the arc either one piece of the body is straight over the ridge or two pieces tie. That condition
+    determines the direction differentiably; the derivative of the parting does not depend on it (envelope theorem).
+    """
+    edge = edges(window)
+    found = _search(kind, *lax.stop_gradient((a, rotation, edge)))
+    length = norm(edge.span)
+    along = normalize(edge.span)
+    flat = normalize(found.up - along * dot(along, found.up))
+    side = cross(along, flat)
+    same = found.piece_minus == found.piece_plus
+
+    def points(up: Vec3) -> tuple[Vec3, Vec3]:
+        local = rotation.apply_transposed(-up)
+        one, other = (rotation.apply(SUPPORT[kind].point(a, p, local)) for p in (found.piece_minus, found.piece_plus))
+        return one - edge.start, other - edge.start
+
+    def turned(angle: Array) -> tuple[Vec3, Vec3]:
+        cosine, sine = jnp.cos(angle), jnp.sin(angle)
+        return flat * cosine + side * sine, side * cosine - flat * sine
+
+    def condition(angle: Array) -> Array:
+        up, across = turned(angle)
+        one, other = points(up)
+        return jnp.where(same, dot(across, one), dot(up, one - other))
+
+    zero = jnp.zeros_like(length + found.up.x)
+    value, rate = jax.jvp(condition, (zero,), (jnp.ones_like(zero),))
+    angle = clamp(-safe_divide(value, lax.stop_gradient(rate)), -LARGEST_CORRECTION, LARGEST_CORRECTION)
+    up, across = turned(angle)
+    one, other = points(up)
+    first, second = dot(across, one), dot(across, other)
+    share = jnp.where(same, 0.0, clamp(safe_divide(first, first - second), 0.0, 1.0))
+    body = one + (other - one) * share
+    separation = dot(up, body)
+    run = dot(along, body)
+    ground = edge.start + along * run
+    valid = lax.stop_gradient((run >= -CONVEX * length) & (run <= (1.0 + CONVEX) * length) & (up.y > 0))
+    valid = settle((valid & found.interior).astype(run.dtype)) > 0.5
+    return Ridges(ground, up, separation, edge.number, valid)
+
+
+def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extreme:
+    along = normalize(edge.span)
+    arc = edge.plus - edge.minus
+
+    def evaluate(share: Array) -> tuple[Array, Array]:
+        """Piece of the body and whether the parting grows toward the plus side, as one settled number each."""
+        up = normalize(edge.minus + arc * share)
+        local = rotation.apply_transposed(-up)
+        code = SUPPORT[kind].code(a, local)
+        point = rotation.apply(SUPPORT[kind].point(a, code, local))
+        grows = dot(cross(along, up), point - edge.start) > 0
+        return code, settle_code(grows.astype(share.dtype))
+
+    zero = jnp.zeros_like(along.x)
+    low, high = zero - BEYOND, zero + 1.0 + BEYOND
+    piece_minus, grows = evaluate(low)
+    piece_plus, still_grows = evaluate(high)
+    convex = dot(cross(edge.minus, edge.plus), along) > CONVEX
+    interior = edge.exists & convex & (grows == 1) & (still_grows == 0)
+
+    def halve(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        low, high, piece_minus, piece_plus = state
+        middle = 0.5 * (low + high)
+        code, grows = evaluate(middle)
+        up = grows == 1
+        return (
+            jnp.where(up, middle, low),
+            jnp.where(up, high, middle),
+            jnp.where(up, code, piece_minus),
+            jnp.where(up, piece_plus, code),
+        )
+
+    shape = jnp.broadcast_shapes(low.shape, piece_minus.shape)
+    state = tuple(jnp.broadcast_to(x, shape) for x in (low, high, piece_minus, piece_plus))
+    low, high, piece_minus, piece_plus = lax.fori_loop(0, BISECTIONS, halve, state)
+    up = normalize(where(interior, edge.minus + arc * (0.5 * (low + high)), edge.minus))
+    return _Extreme(up, piece_minus, piece_plus, interior)
