@@ -54,31 +54,12 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window)
     """
     edge = edges(window)
     found = _search(kind, *lax.stop_gradient((a, rotation, edge)))
+    # The bisection's direction is made exact first: a step from an inexact one has inexact derivatives.
+    exact, *_ = _step(kind, *lax.stop_gradient((a, rotation, edge)), found)
+    up, across, one, other = _step(kind, a, rotation, edge, found._replace(up=lax.stop_gradient(exact)))
+    same = found.piece_minus == found.piece_plus
     length = norm(edge.span)
     along = normalize(edge.span)
-    flat = normalize(found.up - along * dot(along, found.up))
-    side = cross(along, flat)
-    same = found.piece_minus == found.piece_plus
-
-    def points(up: Vec3) -> tuple[Vec3, Vec3]:
-        local = rotation.apply_transposed(-up)
-        one, other = (rotation.apply(SUPPORT[kind].point(a, p, local)) for p in (found.piece_minus, found.piece_plus))
-        return one - edge.start, other - edge.start
-
-    def turned(angle: Array) -> tuple[Vec3, Vec3]:
-        cosine, sine = jnp.cos(angle), jnp.sin(angle)
-        return flat * cosine + side * sine, side * cosine - flat * sine
-
-    def condition(angle: Array) -> Array:
-        up, across = turned(angle)
-        one, other = points(up)
-        return jnp.where(same, dot(across, one), dot(up, one - other))
-
-    zero = jnp.zeros_like(length + found.up.x)
-    value, rate = jax.jvp(condition, (zero,), (jnp.ones_like(zero),))
-    angle = clamp(-safe_divide(value, lax.stop_gradient(rate)), -LARGEST_CORRECTION, LARGEST_CORRECTION)
-    up, across = turned(angle)
-    one, other = points(up)
     first, second = dot(across, one), dot(across, other)
     share = jnp.where(same, 0.0, clamp(safe_divide(first, first - second), 0.0, 1.0))
     body = one + (other - one) * share
@@ -88,6 +69,34 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window)
     valid = lax.stop_gradient((run >= -CONVEX * length) & (run <= (1.0 + CONVEX) * length) & (up.y > 0))
     valid = settle((valid & found.interior).astype(run.dtype)) > 0.5
     return Ridges(ground, up, separation, edge.number, valid)
+
+
+def _step(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, found: _Extreme) -> tuple[Vec3, Vec3, Vec3, Vec3]:
+    """One Newton step of the direction.
+
+    Returns:
+        The direction, the one across it and the ridge, and the points of the two pieces from the start of the edge on.
+    """
+    along = normalize(edge.span)
+    flat = normalize(found.up - along * dot(along, found.up))
+    side = cross(along, flat)
+    same = found.piece_minus == found.piece_plus
+
+    def turned(angle: Array) -> tuple[Vec3, Vec3, Vec3, Vec3]:
+        cosine, sine = jnp.cos(angle), jnp.sin(angle)
+        up, across = flat * cosine + side * sine, side * cosine - flat * sine
+        local = rotation.apply_transposed(-up)
+        one, other = (rotation.apply(SUPPORT[kind].point(a, p, local)) for p in (found.piece_minus, found.piece_plus))
+        return up, across, one - edge.start, other - edge.start
+
+    def condition(angle: Array) -> Array:
+        up, across, one, other = turned(angle)
+        return jnp.where(same, dot(across, one), dot(up, one - other))
+
+    zero = jnp.zeros_like(along.x + found.up.x)
+    value, rate = jax.jvp(condition, (zero,), (jnp.ones_like(zero),))
+    angle = -safe_divide(value, lax.stop_gradient(rate))
+    return turned(clamp(angle, -LARGEST_CORRECTION, LARGEST_CORRECTION))
 
 
 def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extreme:
