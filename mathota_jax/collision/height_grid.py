@@ -179,15 +179,15 @@ def edges(window: Window) -> Edges:
         ),
     ]
 
-    def joined(values: list[Vec3]) -> Vec3:
+    def joined(values: list[Any]) -> Vec3:
         return Vec3(*(jnp.concatenate([listed(v) for v in components]) for components in zip(*values, strict=True)))
 
-    vectors = [joined([group[k] for group in groups]) for k in range(4)]
+    start, along, left, right = (joined([group[k] for group in groups]) for k in range(4))
     exists = [listed(jnp.broadcast_to(g[4], (*g[0].x.shape[:2], *g[4].shape[2:]))) for g in groups]
     shape = jnp.broadcast_shapes(*(e.shape[1:] for e in exists))
     exists = jnp.concatenate([jnp.broadcast_to(e, (e.shape[0], *shape)) for e in exists])
     numbers = jnp.concatenate([3 * group[5] + k for k, group in enumerate(groups)])
-    return Edges(*vectors, exists, numbers)
+    return Edges(start, along, left, right, exists, numbers)
 
 
 def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Array]:

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_lean, pick
+from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_tolerance, pick
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import (
     Window,
@@ -264,7 +264,7 @@ def _reduced(candidates: Candidates, size: Array, base_count: int) -> tuple[Arra
     ground, up, separation = compute_once((ground, up, separation), separation)
     number = separation.dtype
     lowest = jnp.finfo(number).min
-    share = depth_lean(number)
+    share = depth_tolerance(number)
     lean = dot(LEAN, ground)
     score = share * lean - separation
     if base_count:
