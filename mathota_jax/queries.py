@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import Tracer
 
 from mathota_jax.batching import batch_last
 from mathota_jax.collision.height_grid import window_size
@@ -172,7 +173,7 @@ def _windowed(label: str, field: Geometry, other: Geometry) -> Geometry:
     if field.window is not None:
         return field
     sizes = [field.parameters["cell_size"], *other.parameters.values()]
-    if any(isinstance(size, jax.core.Tracer) for size in sizes):
+    if any(isinstance(size, Tracer) for size in sizes):
         raise ValueError(
             f"{label}: the sizes of a {other.kind} and the cells of a heightfield are traced, so how many cells lie under "
             "the shape is unknown; give the number along each side: dataclasses.replace(geometry, window=...)"

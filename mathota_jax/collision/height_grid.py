@@ -148,7 +148,7 @@ def edges(window: Window) -> Edges:
 
         return Vec3(*(attach(c, v) for c, v in zip(normals, side, strict=True)))
 
-    def border(count: int, first: Array, last: Array) -> Array:
+    def border(count: int, first: Any, last: Any) -> Any:
         index = np.arange(count + 1).reshape(-1, 1, 1)
         return ((index > 0) | first) & ((index < count) | last)
 
@@ -179,7 +179,7 @@ def edges(window: Window) -> Edges:
         ),
     ]
 
-    def joined(values: list[Vec3]) -> Vec3:
+    def joined(values: list[Any]) -> Vec3:
         return Vec3(*(jnp.concatenate([listed(v) for v in components]) for components in zip(*values, strict=True)))
 
     vectors = [joined([group[k] for group in groups]) for k in range(4)]
@@ -187,7 +187,8 @@ def edges(window: Window) -> Edges:
     shape = jnp.broadcast_shapes(*(e.shape[1:] for e in exists))
     exists = jnp.concatenate([jnp.broadcast_to(e, (e.shape[0], *shape)) for e in exists])
     numbers = jnp.concatenate([3 * group[5] + k for k, group in enumerate(groups)])
-    return Edges(*vectors, exists, numbers)
+    start, span, minus, plus = vectors
+    return Edges(start, span, minus, plus, exists, numbers)
 
 
 def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Array]:
