@@ -148,7 +148,7 @@ def edges(window: Window) -> Edges:
 
         return Vec3(*(attach(c, v) for c, v in zip(normals, side, strict=True)))
 
-    def border(count: int, first: Array, last: Array) -> Array:
+    def border(count: int, first: Any, last: Any) -> Any:
         index = np.arange(count + 1).reshape(-1, 1, 1)
         return ((index > 0) | first) & ((index < count) | last)
 
@@ -182,12 +182,13 @@ def edges(window: Window) -> Edges:
     def joined(values: list[Any]) -> Vec3:
         return Vec3(*(jnp.concatenate([listed(v) for v in components]) for components in zip(*values, strict=True)))
 
-    start, along, left, right = (joined([group[k] for group in groups]) for k in range(4))
+    vectors = [joined([group[k] for group in groups]) for k in range(4)]
     exists = [listed(jnp.broadcast_to(g[4], (*g[0].x.shape[:2], *g[4].shape[2:]))) for g in groups]
     shape = jnp.broadcast_shapes(*(e.shape[1:] for e in exists))
     exists = jnp.concatenate([jnp.broadcast_to(e, (e.shape[0], *shape)) for e in exists])
     numbers = jnp.concatenate([3 * group[5] + k for k, group in enumerate(groups)])
-    return Edges(start, along, left, right, exists, numbers)
+    start, span, minus, plus = vectors
+    return Edges(start, span, minus, plus, exists, numbers)
 
 
 def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Array]:
