@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.shortfalls import SHORTFALLS, TIMINGS
+from tests.sweeps import is_sweep
 
 MEMORY_MAPS = Path("/proc/self/maps")
 MEMORY_MAPS_KEPT = 20_000
@@ -34,9 +35,12 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the gates that are not met yet as strict expected failures."""
+    """Marks the slow sweeps, and the gates that are not met yet as strict expected failures."""
     for item in items:
+        if is_sweep(item.nodeid):
+            item.add_marker(pytest.mark.slow)
         for prefix, reason in {**SHORTFALLS, **TIMINGS}.items():
             if item.nodeid == prefix or item.nodeid.startswith(prefix + "["):
                 item.add_marker(pytest.mark.xfail(strict=prefix in SHORTFALLS, reason=reason))

@@ -30,7 +30,7 @@ def test_absence_is_seen():
 
 
 def test_there_is_an_example_for_each_reader():
-    assert len(EXAMPLES) == 3
+    assert len(EXAMPLES) == 4
 
 
 @pytest.mark.parametrize("number", range(len(EXAMPLES)))
