@@ -7,15 +7,8 @@ from mathota_jax.collision.pairs.box_box import box_box
 from mathota_jax.collision.pairs.capsule_box import capsule_box
 from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule
 from mathota_jax.collision.pairs.convex import convex_pair, convex_point_count
-from mathota_jax.collision.pairs.convex_heightfield import (
-    HEIGHTFIELD_POINTS,
-    box_heightfield,
-    capsule_heightfield,
-    cone_heightfield,
-    cylinder_heightfield,
-    polyhedron_heightfield,
-    sphere_heightfield,
-)
+from mathota_jax.collision.pairs.convex_heightfield import HEIGHTFIELD_POINTS, heightfield_pair
+from mathota_jax.collision.pairs.convex_heightfield import KINDS as HEIGHTFIELD_KINDS
 from mathota_jax.collision.pairs.plane_box import plane_box
 from mathota_jax.collision.pairs.plane_capsule import plane_capsule
 from mathota_jax.collision.pairs.plane_cone import plane_cone
@@ -76,12 +69,10 @@ PAIRS: dict[tuple[str, str], Pair] = {
     ("capsule", "capsule"): Pair(capsule_capsule, 2),
     ("capsule", "box"): Pair(capsule_box, 2),
     ("box", "box"): Pair(box_box, 4, SEPARATING_AXES),
-    ("sphere", "heightfield"): Pair(sphere_heightfield, HEIGHTFIELD_POINTS, LOCAL_CELLS),
-    ("capsule", "heightfield"): Pair(capsule_heightfield, HEIGHTFIELD_POINTS, LOCAL_CELLS),
-    ("box", "heightfield"): Pair(box_heightfield, HEIGHTFIELD_POINTS, LOCAL_CELLS),
-    ("cylinder", "heightfield"): Pair(cylinder_heightfield, HEIGHTFIELD_POINTS, LOCAL_CELLS),
-    ("cone", "heightfield"): Pair(cone_heightfield, HEIGHTFIELD_POINTS, LOCAL_CELLS),
-    ("polyhedron", "heightfield"): Pair(polyhedron_heightfield, HEIGHTFIELD_POINTS, LOCAL_CELLS),
+}
+PAIRS |= {
+    (kind.name, "heightfield"): Pair(heightfield_pair(kind), HEIGHTFIELD_POINTS, LOCAL_CELLS)
+    for kind in HEIGHTFIELD_KINDS
 }
 PAIRS |= {(a, b): _convex(a, b) for k, a in enumerate(CONVEX) for b in CONVEX[k:] if (a, b) not in PAIRS}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from mathota_jax.collision.heightfield import Kind, heightfield_contacts
@@ -20,39 +21,22 @@ from mathota_jax.spatial.pose import Pose
 
 HEIGHTFIELD_POINTS = 4
 
-SPHERE = Kind("sphere", sphere_sphere)
-CAPSULE = Kind("capsule", sphere_capsule)
-BOX = Kind("box", sphere_box, plane_box)
-CYLINDER = Kind("cylinder", sphere_cylinder, plane_cylinder)
-CONE = Kind("cone", sphere_cone, plane_cone)
-POLYHEDRON = Kind("polyhedron", sphere_polyhedron, plane_polyhedron)
+KINDS = (
+    Kind("sphere", sphere_sphere),
+    Kind("capsule", sphere_capsule),
+    Kind("box", sphere_box, plane_box),
+    Kind("cylinder", sphere_cylinder, plane_cylinder),
+    Kind("cone", sphere_cone, plane_cone),
+    Kind("polyhedron", sphere_polyhedron, plane_polyhedron),
+)
+"""Convex kinds that meet heightfields."""
 
 
-def sphere_heightfield(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
-    """Up to four contacts; see `heightfield_contacts`."""
-    return heightfield_contacts(SPHERE, a, pose_a, b, pose_b)
+def heightfield_pair(kind: Kind) -> Callable[[dict[str, Any], Pose, dict[str, Any], Pose], Manifold]:
+    """Pair function of a convex kind and a heightfield; see `heightfield_contacts`."""
 
+    def pair(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
+        return heightfield_contacts(kind, a, pose_a, b, pose_b)
 
-def capsule_heightfield(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
-    """Up to four contacts; see `heightfield_contacts`."""
-    return heightfield_contacts(CAPSULE, a, pose_a, b, pose_b)
-
-
-def box_heightfield(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
-    """Up to four contacts; see `heightfield_contacts`."""
-    return heightfield_contacts(BOX, a, pose_a, b, pose_b)
-
-
-def cylinder_heightfield(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
-    """Up to four contacts; see `heightfield_contacts`."""
-    return heightfield_contacts(CYLINDER, a, pose_a, b, pose_b)
-
-
-def cone_heightfield(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
-    """Up to four contacts; see `heightfield_contacts`."""
-    return heightfield_contacts(CONE, a, pose_a, b, pose_b)
-
-
-def polyhedron_heightfield(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
-    """Up to four contacts; see `heightfield_contacts`."""
-    return heightfield_contacts(POLYHEDRON, a, pose_a, b, pose_b)
+    pair.__name__ = f"{kind.name}_heightfield"
+    return pair
