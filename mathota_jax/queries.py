@@ -337,8 +337,12 @@ def _impact(
 ) -> Impact:
     movers = _mover(a, pose_a, motion_a), _mover(b, pose_b, motion_b)
     duration = duration[None]
-    time, hit = _advance(*lax.stop_gradient(movers), lax.stop_gradient(duration))
+    touching = 16.0 * jnp.finfo(duration.dtype).eps * jnp.minimum(*(lax.stop_gradient(m.reach) for m in movers))
+    time = _advance(*lax.stop_gradient(movers), lax.stop_gradient(duration), touching)
     nearest = _nearest(a, movers[0].at(time), b, movers[1].at(time))
+    # The advances shrink the gap geometrically: what is left of it counts as touching if time remains.
+    gap = lax.stop_gradient(nearest.separation)
+    hit = settle(jnp.where((gap <= 2.0 * touching) | (time < duration), 1.0, 0.0)) > 0.5
     # One Newton step of the root's time: no change of the value, the exact derivative (implicit function theorem).
     rate = lax.stop_gradient(_approach(*movers, time, nearest))
     touches = hit & (time > 0) & (rate < 0)
@@ -358,11 +362,9 @@ def _mover(geometry: Geometry, pose: NaturalPose, motion: NaturalPose) -> _Mover
     return _Mover(geometry, position, orientation, velocity, angular_velocity, reach)
 
 
-def _advance(a: _Mover, b: _Mover, duration: Array) -> tuple[Array, Array]:
-    """Time of the first contact or the duration, and whether there is one; components (1, world)."""
-    size = jnp.minimum(*(jnp.where(jnp.isfinite(mover.reach), mover.reach, jnp.inf) for mover in (a, b)))
+def _advance(a: _Mover, b: _Mover, duration: Array, touching: Array) -> Array:
+    """Time (1, world) at which the gap is `touching`, or the duration."""
     worlds = np.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves((a[1:5], b[1:5]))), jnp.shape(duration))
-    touching = 16.0 * jnp.finfo(duration.dtype).eps * size
 
     def advance(_: int, time: Array) -> Array:
         found = _nearest(a.geometry, a.at(time), b.geometry, b.at(time))
@@ -372,11 +374,7 @@ def _advance(a: _Mover, b: _Mover, duration: Array) -> tuple[Array, Array]:
         stays = settle(jnp.where(gap <= 0, 1.0, 0.0)) > 0.5
         return jnp.where(stays, time, jnp.minimum(time + step, duration))
 
-    time = lax.fori_loop(0, ADVANCES, advance, jnp.zeros(worlds, duration.dtype))
-    gap = _nearest(a.geometry, a.at(time), b.geometry, b.at(time)).separation
-    # The advances shrink the gap geometrically: what is left of it counts as touching if time remains.
-    hit = settle(jnp.where((gap <= 2.0 * touching) | (time < duration), 1.0, 0.0)) > 0.5
-    return time, hit
+    return lax.fori_loop(0, ADVANCES, advance, jnp.zeros(worlds, duration.dtype))
 
 
 def _spin(mover: _Mover, normal: Vec3) -> Array:
