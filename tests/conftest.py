@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.shortfalls import SHORTFALLS, TIMINGS
-from tests.sweeps import is_sweep
 
 MEMORY_MAPS = Path("/proc/self/maps")
 MEMORY_MAPS_KEPT = 20_000
@@ -35,12 +34,9 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the slow sweeps, and the gates that are not met yet as strict expected failures."""
+    """Marks the gates that are not met yet as strict expected failures."""
     for item in items:
-        if is_sweep(item.nodeid):
-            item.add_marker(pytest.mark.slow)
         for prefix, reason in {**SHORTFALLS, **TIMINGS}.items():
             if item.nodeid == prefix or item.nodeid.startswith(prefix + "["):
                 item.add_marker(pytest.mark.xfail(strict=prefix in SHORTFALLS, reason=reason))
@@ -59,17 +55,17 @@ def pytest_runtest_teardown() -> None:
 
 
 @pytest.fixture(params=["float32", "float64"])
-def precision(request: pytest.FixtureRequest) -> Iterator[str]:
+def precision(request: pytest.FixtureRequest) -> Iterator[np.dtype]:
     """Runs the test once in each floating-point precision."""
     with jax.enable_x64(request.param == "float64"):
-        yield request.param
+        yield np.dtype(request.param)
 
 
 @pytest.fixture
-def float64() -> Iterator[None]:
+def float64() -> Iterator[np.dtype]:
     """Runs the test in double precision."""
     with jax.enable_x64(True):
-        yield
+        yield np.dtype("float64")
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ def test_one_bounce_without_gravity(precision, dt, gate):
     gate("height / truth - 1", value / 1.2 - 1, 1e-3)
     force_slope = -(1.0 * dt - dt**2 / 2)  # a force in the first step only, mirrored by the impact
     truth = {"height": -1.0, "velocity": -1.0, "restitution": 1.1, "radius": 2.0, "first force": force_slope}
-    check(gate, slopes, truth, LIMIT[precision])
+    check(gate, slopes, truth, LIMIT[str(precision)])
 
 
 @pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
@@ -99,7 +99,7 @@ def test_one_bounce_under_gravity(precision, dt, gate):
         "gravity": -0.011585885,
         "time": -0.284143841,
     }
-    check(gate, slopes, truth, LIMIT[precision])
+    check(gate, slopes, truth, LIMIT[str(precision)])
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ FACTORS = (0.0, 0.5, 0.9, 0.99, 1.0, 1.01, 1.1, 6.0 / THRESHOLD, 3.0)
 def test_both_sides_of_the_threshold(precision, gate):
     factors = np.array(FACTORS)
     force, velocity, by_force, by_friction = pushed(factors)
-    limit = {"float32": 1e-3, "float64": 1e-4}[precision]
+    limit = {"float32": 1e-3, "float64": 1e-4}[str(precision)]
     sticks, slips = factors <= 0.99, factors >= 1.01
     gate("sticking: v [m/s]", velocity[sticks], limit)
     gate("sticking: dv/dF [1/kg s]", by_force[sticks], limit)

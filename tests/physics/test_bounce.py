@@ -103,7 +103,9 @@ def test_frictional_bounce(precision, dt, gate):
     measured = np.stack([final.velocity[:, 1, 0], final.velocity[:, 1, 1], -final.angular_velocity[:, 1, 2]], axis=-1)
     scale = np.array([5.0, 5.0, 50.0])
     gate(
-        "velocity and spin after the bounce", (measured - truth) / scale, {"float32": 1e-5, "float64": 1e-9}[precision]
+        "velocity and spin after the bounce",
+        (measured - truth) / scale,
+        {"float32": 1e-5, "float64": 1e-9}[str(precision)],
     )
 
 

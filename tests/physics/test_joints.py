@@ -223,7 +223,7 @@ def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     leaves = {"mass": model.mass, "inertia": model.inertia}
     arrays = [(s.position, s.orientation, s.velocity, s.angular_velocity) for s in (state, final)]
     (_, linear, angular), (_, linear_after, angular_after) = (invariants(leaves, *a) for a in arrays)
-    gate("linear momentum [kg m/s]", linear_after - linear, {"float32": 2e-5, "float64": 1e-10}[precision])
+    gate("linear momentum [kg m/s]", linear_after - linear, {"float32": 2e-5, "float64": 1e-10}[str(precision)])
     gate("angular momentum [kg m^2/s]", angular_after - angular, 1e-3)
     assert abs(float(joint_velocity(model, final)[0])) > 0.1, "the motor does not move the joint"
 

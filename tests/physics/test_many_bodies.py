@@ -109,7 +109,7 @@ def test_same_gradient_as_with_a_slot_for_every_pair(float64, gate):
     assert np.any(np.asarray(gradients[1][1]))
 
 
-@pytest.mark.parametrize("count", [64, 200])
+@pytest.mark.parametrize("count", [64, pytest.param(200, marks=pytest.mark.slow)])
 def test_cloud_conserves_momentum_and_does_not_gain_energy(count, precision, gate):
     """No gravity, no ground in reach, spheres thrown at each other: several hundred collisions."""
     model, state = heap(count, gravity=0.0, height=1000.0, restitution=0.5)

@@ -22,7 +22,7 @@ def test_zero_friction_equals_no_friction(precision, gate):
         neutral = dataclasses.replace(with_rows, friction=jnp.zeros_like(with_rows.friction))
         without, other = scene(friction=0.0, **start)
         difference = trajectory(neutral, state) - trajectory(without, other)
-        gate("trajectory", difference, {"float32": 60e-6, "float64": 60e-12}[precision])
+        gate("trajectory", difference, {"float32": 60e-6, "float64": 60e-12}[str(precision)])
 
 
 def test_zero_restitution_equals_no_restitution(precision, gate):
@@ -32,7 +32,7 @@ def test_zero_restitution_equals_no_restitution(precision, gate):
     neutral = dataclasses.replace(with_events, restitution=jnp.zeros_like(with_events.restitution))
     without, other = sphere_on_plane(restitution=0.0, **start)
     difference = trajectory(neutral, state) - trajectory(without, other)
-    gate("trajectory", difference, {"float32": 60e-6, "float64": 60e-12}[precision])
+    gate("trajectory", difference, {"float32": 60e-6, "float64": 60e-12}[str(precision)])
 
 
 def test_zero_gravity_and_distant_company_change_nothing(precision, gate):
@@ -50,4 +50,4 @@ def test_zero_gravity_and_distant_company_change_nothing(precision, gate):
     alone, crowded = (advance(*scene(company), 60) for company in (False, True))
     for leaf in ("position", "orientation", "velocity", "angular_velocity"):
         difference = getattr(crowded, leaf)[1] - getattr(alone, leaf)[1]
-        gate(leaf, difference, {"float32": 1e-5, "float64": 1e-12}[precision])
+        gate(leaf, difference, {"float32": 1e-5, "float64": 1e-12}[str(precision)])

@@ -80,7 +80,7 @@ def test_momentum_and_energy_are_kept_and_do_not_drift(precision, gate):
         start_energy = 0.5 * np.sum(INERTIA * spin**2)
         error = np.linalg.norm(momentum[:, world] - start, axis=-1) / np.linalg.norm(start)
         drift = energy[:, world] / start_energy - 1
-        gate(f"{case}: momentum over 10 s, dt 0.01", error[:1000], {"float32": 1e-5, "float64": 1e-6}[precision])
+        gate(f"{case}: momentum over 10 s, dt 0.01", error[:1000], {"float32": 1e-5, "float64": 1e-6}[str(precision)])
         gate(f"{case}: energy over 10 s, dt 0.01", drift[:1000], 1e-3)
         gate(f"{case}: energy over 100 s, dt 0.01 (no secular part)", drift, 1e-3)
 

@@ -38,18 +38,6 @@ COUNT = 256
 BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
-@pytest.fixture(params=["float32", "float64"])
-def precision(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield np.dtype("float64")
-
-
 # ---- scenes: one pair, one pose a row; polyhedra share their vertices between the rows -----------------------------
 
 

@@ -30,12 +30,6 @@ def every_pair(*quick):
     return [pytest.param(pair, id="_".join(pair), marks=() if pair in quick else pytest.mark.slow) for pair in PAIRS]
 
 
-@pytest.fixture(params=["float32", "float64"])
-def precision(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
 # ---- scenes: natural arrays in NumPy, one pose a row -------------------------------------------------------------
 
 
@@ -301,6 +295,7 @@ def test_many_random_poses(pair, precision):
     check(pair, random_scene(pair, SLOW_COUNT, ("", "")), precision)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [1e-2, 1e-4, -1e-4, -1e-2])
 @pytest.mark.parametrize("pair", every_pair(*QUICK))
 def test_touching_and_shallow_poses(pair, gap, precision):
@@ -312,6 +307,7 @@ def test_touching_and_shallow_poses(pair, gap, precision):
     assert np.all((result.separation < 0) == (gap < 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "forms", [("needle", "plate"), ("plate", "plate"), ("needle", "needle"), ("small", ""), ("", "small")]
 )
@@ -320,6 +316,7 @@ def test_extreme_forms(pair, forms, precision):
     check(pair, random_scene(pair, NORMAL_COUNT, forms, reach=1.0), precision)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", every_pair(*QUICK))
 def test_nearly_coincident_centres(pair, precision):
     scene = random_scene(pair, NORMAL_COUNT)
@@ -381,6 +378,7 @@ def degenerate_scene(pair):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", every_pair(("box", "cylinder")))
 def test_degenerate_poses(pair, precision):
     """Coincident centres, parallel axes, exact touch of faces, edges and corners, tilts to nothing: right and finite."""
@@ -409,6 +407,7 @@ def test_degenerate_poses(pair, precision):
 # ---- derivatives -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", every_pair(("cylinder", "polyhedron")))
 def test_derivatives_against_central_differences(pair):
     """Separation, normal and both points by every parameter and pose component, away from changes of feature."""
@@ -446,6 +445,7 @@ def test_derivatives_against_central_differences(pair):
         assert compared >= 14
 
 
+@pytest.mark.slow
 def test_reverse_mode_agrees_with_forward():
     pair = ("cylinder", "polyhedron")
     with jax.enable_x64(True):

@@ -45,7 +45,7 @@ def test_energy_and_momenta_against_numpy(precision, gate):
     kinetic, linear, angular = invariants(leaves, *moving)
     mass, place = np.asarray(model.mass[1:], dtype=float), np.asarray(state.position[1:], dtype=float)
     potential = -np.sum(mass[:, None] * place * [0.5, -9.0, 1.0])
-    limit = {"float32": 1e-5, "float64": 1e-12}[precision]
+    limit = {"float32": 1e-5, "float64": 1e-12}[str(precision)]
     assert jnp.shape(energy(model, state)) == ()
     gate("energy / truth - 1", float(energy(model, state)) / (kinetic + potential) - 1, limit)
     gate("momentum", (np.asarray(momentum(model, state)) - linear) / np.abs(linear).max(), limit)
@@ -66,7 +66,7 @@ def test_contact_of_a_sphere_with_the_plane(precision, gate):
     for height in (-0.02, 0.0, 0.3):
         model, state = sphere_on_plane(height=height)
         found = contacts(model, state)
-        limit = {"float32": 1e-6, "float64": 1e-12}[precision]
+        limit = {"float32": 1e-6, "float64": 1e-12}[str(precision)]
         gate(f"separation at {height} m", found.separation - height, limit)
         gate("normal, plane to sphere", found.normal - jnp.array([0.0, 1.0, 0.0]), limit)
         gate("point between the surfaces [m]", found.position - jnp.array([0.0, height / 2, 0.0]), limit)

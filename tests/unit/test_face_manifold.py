@@ -25,18 +25,6 @@ HEXAGON = np.array([[np.cos(a), y, np.sin(a)] for a in np.arange(6) * np.pi / 3 
 KINDS = ("capsule", "box", "cylinder", "cone", "polyhedron")
 
 
-@pytest.fixture(params=["float32", "float64"])
-def precision(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield np.dtype("float64")
-
-
 class Contact(NamedTuple):
     """What the distance query hands to the manifold."""
 
@@ -252,6 +240,7 @@ def test_shapes_on_a_plate(name, plate, precision):
             assert np.all(hulled.equations[:, :2] @ center[[0, 2]] + hulled.equations[:, 2] < 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexagonal prism", "cylinder", "cylinder on its side", "cone", "capsule"])
 def test_generic_pair_on_a_plate(name, precision):
     """The same from nothing but shapes and poses: distance search, then manifold."""
@@ -457,6 +446,7 @@ def test_edge_contact_keeps_the_witness_alone(float64):
     assert set(result.feature[:, 0]) == {witness_feature("box", engine(shape, float64), "box", engine(shape, float64))}
 
 
+@pytest.mark.slow
 def test_patch_of_flat_prisms_against_polygon_intersection(float64):
     """Prisms face on face: the points are on the exact patch, and span at least the best quadrilateral of an n-gon."""
     rng = np.random.default_rng(5)
@@ -546,15 +536,20 @@ def test_crossed_cylinders_touch_in_one_point(precision):
 # ---- continuity and features ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["box", "polyhedral box", "capsule", "cylinder on its side"])
-def test_sliding_across_the_edge_moves_points_continuously(name, float64):
-    """Steps of 1e-3 across the edge of the plate: the ends of the patch move by at most 1e-2 of the size."""
+def slid_across_the_edge(name, dtype):
+    """A body in steps of 1e-3 across the edge of the plate: the manifolds, and their points in the plate's frame."""
     shape, pose, _, _ = POSES[name]
     steps = np.arange(COUNT) * 1e-3 + 1.45
     turns = [Rotation.from_rotvec([0, 0.3, 0]) * pose] * COUNT
     scene = resting(shape, PLATES["box"], turns, np.stack([steps, np.zeros(COUNT)], 1))
-    result = Result(scene, float64)
-    points = seen_from_plate(scene, result)
+    result = Result(scene, dtype)
+    return result, seen_from_plate(scene, result)
+
+
+@pytest.mark.parametrize("name", ["box", "polyhedral box", "capsule", "cylinder on its side"])
+def test_sliding_across_the_edge_moves_points_continuously(name, float64):
+    """Steps of 1e-3 across the edge of the plate: the ends of the patch move by at most 1e-2 of the size."""
+    result, points = slid_across_the_edge(name, float64)
     spans = []
     for index in range(COUNT):
         spans.append(np.r_[points[index][result.active[index]].min(0), points[index][result.active[index]].max(0)])
@@ -564,12 +559,7 @@ def test_sliding_across_the_edge_moves_points_continuously(name, float64):
 @pytest.mark.parametrize("name", ["hexagonal prism", "cylinder", "cone"])
 def test_sliding_many_corners_keeps_the_base(name, float64):
     """Patches of more than four vertices: whichever four are kept, the base changes little from step to step."""
-    shape, pose, _, _ = POSES[name]
-    steps = np.arange(COUNT) * 1e-3 + 1.45
-    turns = [Rotation.from_rotvec([0, 0.3, 0]) * pose] * COUNT
-    scene = resting(shape, PLATES["box"], turns, np.stack([steps, np.zeros(COUNT)], 1))
-    result = Result(scene, float64)
-    points = seen_from_plate(scene, result)
+    result, points = slid_across_the_edge(name, float64)
     areas = [ConvexHull(p[a][:, [0, 2]]).volume for p, a in zip(points, result.active, strict=True)]
     assert np.abs(np.diff(areas)).max() < 0.15 * max(areas)
 
@@ -619,6 +609,7 @@ def plate_contact(shape_a, shape_b, a, pa, qa, b, pb, qb):
     return Contact(up, gap, point_b - up * gap, point_b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexagonal prism", "cylinder", "cylinder on its side", "capsule"])
 def test_derivative_against_central_differences(name, float64):
     """Separations and positions of all points with respect to both poses and all sizes.
@@ -697,6 +688,7 @@ def test_derivative_against_central_differences(name, float64):
 DEGENERATE = list(itertools.combinations_with_replacement(KINDS, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", DEGENERATE, ids="_".join)
 def test_no_value_or_derivative_is_ever_nan(pair):
     """Coincident centres, normals along axes, across them and along corners, zero and huge separations."""

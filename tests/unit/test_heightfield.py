@@ -34,6 +34,9 @@ FUNCTIONS = {
     "polyhedron": plane_polyhedron,
 }
 KINDS = list(FUNCTIONS)
+QUICK_AND_SLOW_KINDS = [
+    kind if kind in ("sphere", "box") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS
+]
 STONE = np.random.default_rng(7).normal(size=(12, 3)) * [0.25, 0.2, 0.3]
 STONE, STONE_FACES = hull(STONE)
 SIZES = {
@@ -129,7 +132,7 @@ def poses(count, seed, spread=0.5, height=(0.0, 0.6)):
 # ---- flat and inclined ground equals the plane --------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", QUICK_AND_SLOW_KINDS)
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.3, -0.2)], ids=["flat", "inclined"])
 def test_even_ground_is_a_plane(kind, slope, float64, gate):
     rows, columns = 13, 15
@@ -290,6 +293,7 @@ def nearest_in_body(kind, point):
     return np.stack([best[:, 0] * direction[:, 0], best[:, 1], best[:, 0] * direction[:, 1]], -1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS[1:])
 def test_distance_from_hills(kind, float64, gate):
     """Dense samples of the body find the nearest triangles, alternating projections the distance from each."""
@@ -342,6 +346,7 @@ def deepest(kind, position, orientation, heights, cell, sizes):
     return values, point.feature[0], point.active[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_are_those_of_differences(kind, float64, gate):
     """By the pose, the heights, the cell size and the sizes of the body, along random directions."""
@@ -373,6 +378,7 @@ def test_derivatives_are_those_of_differences(kind, float64, gate):
     gate("reverse mode", total / jnp.sum(weights * rate) - 1.0, 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_beside_the_field_there_is_no_ground(kind, precision):
     reach = REACH[kind]
@@ -388,6 +394,7 @@ def test_beside_the_field_there_is_no_ground(kind, precision):
 # ---- features ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["box", "cylinder", "cone", "polyhedron", "capsule"])
 def test_peak_under_a_face(kind, float64):
     """A thin spike holds a body that lies over it; nothing else of the body is near the ground."""
@@ -432,6 +439,7 @@ def test_ridge_across_an_edge(float64):
         np.testing.assert_allclose(found["position"][0, 0], [lowest[0], 0.5 + 0.5 * gap, 0.0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_rotated_and_moved_field(float64):
     """Contacts move with the pose of the field."""
     position, orientation = over_the_hills("box", 20, 14)
@@ -481,6 +489,7 @@ def test_box_rests_and_slides_as_on_a_plane(slope, float64, gate):
     assert np.abs(truth[1][-1]).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["capsule", "hull", "box"])
 def test_bodies_come_to_rest_on_hills(name):
     shape = {"capsule": Capsule(0.12, 0.3), "hull": Polyhedron(STONE), "box": Box((0.3, 0.15, 0.25))}[name]
@@ -507,6 +516,7 @@ def test_sphere_rolls_in_a_bowl(gate):
     assert (position[:, 1] > 0.29).all()
 
 
+@pytest.mark.slow
 def test_queries_with_heightfields(float64, gate):
     ground, sphere = Heightfield(HILLS, CELL), Sphere(0.3)
     position = np.array([0.1, 0.6, -0.2])

@@ -31,18 +31,6 @@ FACE_MARGIN = 1e-3  # box faces are preferred to edges by this share of the size
 EDGE_SHARE = 0.05  # ... and of the depth
 
 
-@pytest.fixture(params=["float32", "float64"])
-def precision(request):
-    with jax.enable_x64(request.param == "float64"):
-        yield np.dtype(request.param)
-
-
-@pytest.fixture
-def float64():
-    with jax.enable_x64(True):
-        yield np.dtype("float64")
-
-
 # ---- scenes: natural arrays in NumPy, one pose a row -------------------------------------------------------------
 
 

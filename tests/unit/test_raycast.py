@@ -175,6 +175,7 @@ def test_rays_meet_shapes_where_their_inside_begins(name, precision):
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), hit, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 def test_normals_are_those_of_the_surface(name, float64):
     """``d distance / d origin = -n / (n . d)``, with central differences of the oracle."""
@@ -299,6 +300,7 @@ def test_bad_rays_are_named(name, bad):
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SHAPE)
 def test_derivatives_match_central_differences(kind, float64):
     """Of distance and normal, by origin, direction, pose and every size, at hits away from edges."""
