@@ -22,7 +22,16 @@ from mathota_jax.bodies import (
     vector,
 )
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
-from mathota_jax.constraints import compact, contact, joint, warm_start
+from mathota_jax.constraints import (
+    compact,
+    contact,
+    joint,
+    joint_layout,
+    joint_rows,
+    motor,
+    row_coefficients,
+    warm_start,
+)
 from mathota_jax.constraints.assembly import Side, collect
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
@@ -104,15 +113,15 @@ def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, St
 class _Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word."""
 
-    joints: joint.JointRows | None
-    joint_rows: tuple[Rows, ...]
+    joints: joint_rows.JointRows | None
+    joint_rows: tuple[joint.JointConstraint, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
     close: compact.ClosePairs | None
 
     @property
     def rows(self) -> tuple[Rows, ...]:
-        return (*self.joint_rows, *(group.rows for group in self.contact_rows))
+        return (*(group.rows for group in self.joint_rows), *(group.rows for group in self.contact_rows))
 
 
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
@@ -125,10 +134,10 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     force, torque = _external(model, state, bodies, action)
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
-    problem = _constrain(model, state, bodies, blocks, inertia, free)
+    problem = _constrain(model, state, bodies, blocks, inertia, free, action)
     start = _warm_start(model, state, problem)
     solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
-    lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
+    lever_sum = _lever_sum(problem, impulses, jnp.zeros_like(solved))
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
@@ -141,8 +150,8 @@ _batched_step = batch_last(step_worlds_last)
 def _external(model: Model, state: State, bodies: Bodies, action: Array) -> tuple[Vec3, Vec3]:
     """Phase 1: forces and torques on the moving bodies, gravity excepted."""
     force, torque = vector(state.applied_force), vector(state.applied_torque)
-    if model.scene.motors:
-        motor_force, motor_torque = joint.motor_forces(model, bodies, action)
+    if motor.exert_torque(model.scene):
+        motor_force, motor_torque = motor.motor_forces(model, bodies, action)
         force, torque = force + motor_force, torque + motor_torque
     return take((force, torque), model.scene.dynamic_bodies)
 
@@ -170,17 +179,29 @@ def _pack(scene: Scene, linear: Vec3, angular: Vec3) -> Array:
 
 
 def _constrain(
-    model: Model, state: State, bodies: Bodies, blocks: Bodies, inertia: Inertia, free: tuple[Vec3, Vec3]
+    model: Model,
+    state: State,
+    bodies: Bodies,
+    blocks: Bodies,
+    inertia: Inertia,
+    free: tuple[Vec3, Vec3],
+    action: Array,
 ) -> _Problem:
     """Phases 2, 3 and 5: narrow phase and rows."""
     scene = model.scene
-    joints, joint_rows = None, ()
-    if scene.joints:
-        joints = joint.joint_rows(model, bodies)
-        middle = joint.joint_rows(model, joint.midpoint(bodies, model.dt))
-        joint_rows = tuple(
-            joint.velocity_rows(scene, table, model, joints, middle, inertia) for table in joint.joint_tables(scene)
+    joints, tables = None, ()
+    if joint_layout.joint_row_count(scene):
+        joints = joint_rows.joint_rows(model, bodies)
+        middle = joint_rows.joint_rows(model, joint_rows.moved_by(bodies, 0.5 * model.dt))
+        motion = joint.JointMotion(
+            joints,
+            middle,
+            row_coefficients.row_coefficients(model, action),
+            inertia,
+            Side(blocks.velocity, blocks.angular_velocity),
+            Side(*free),
         )
+        tables = tuple(joint.velocity_rows(scene, table, model, motion) for table in joint_layout.joint_tables(scene))
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
         found = []
@@ -207,7 +228,7 @@ def _constrain(
             for group in (close.groups if close else ())
             for table, pairs in group.tables
         ]
-    return _Problem(joints, joint_rows, contacts, contact_rows, close)
+    return _Problem(joints, tables, contacts, contact_rows, close)
 
 
 def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, ...]:
@@ -215,8 +236,8 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
     start = [
-        joint.joint_impulse_start(rows.table, state.joint_force, model.dt, rows.bias.shape[-1])
-        for rows in problem.joint_rows
+        joint.joint_impulse_start(group.rows.table, state.joint_force, model.dt, group.rows.bias.shape[-1])
+        for group in problem.joint_rows
     ]
     if problem.contacts is not None:
         old, feature = vector(state.contact_force), state.contact_feature
@@ -245,12 +266,11 @@ def _gradient_iterations(scene: Scene, iterations: int) -> int:
     return scene.options.gradient_iterations or 2 * iterations
 
 
-def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
-    """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
-    count = len(problem.joint_rows)
-    halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
-    return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
+def _lever_sum(problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
+    """Displacement caused by the impulses: joints hold for the whole step, stops and contacts as long as they last."""
+    groups = (*problem.joint_rows, *problem.contact_rows)
+    levers = tuple(impulse * group.lever for impulse, group in zip(impulses, groups, strict=True))
+    return pgs.add_impulses(problem.rows, zero, levers)
 
 
 def _correct_positions(
@@ -264,10 +284,9 @@ def _correct_positions(
     packed = _pack(scene, *displacement)
     rows: list[Rows] = []
     if problem.joints is not None:
-        error = joint.joint_rows(model, _merge(scene, bodies, moved)).error
+        error = joint_rows.joint_rows(model, _merge(scene, bodies, moved)).error
         rows += [
-            joint.position_rows(scene, group.table, problem.joints, error, inertia, options.position_percent)
-            for group in problem.joint_rows
+            joint.position_rows(scene, group.rows.table, problem.joints, error, inertia) for group in problem.joint_rows
         ]
     for group in problem.contact_rows:
         change = pgs.row_velocity(group.rows, packed)[:, :1]
@@ -307,9 +326,9 @@ def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> dic
     scene, count = model.scene, len(problem.joint_rows)
     changes: dict[str, Array] = {}
     if problem.joints is not None:
-        tables = [rows.table for rows in problem.joint_rows]
+        tables = [group.rows.table for group in problem.joint_rows]
         values = [impulse[:, 0] / model.dt for impulse in impulses[:count]]
-        changes["joint_force"] = collect(tables, values, joint.joint_row_count(scene))
+        changes["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
     if problem.contacts is not None:
         impulses = impulses[count:]
         changes["contact_force"] = contact.slot_force(problem.contact_rows, list(impulses), scene.slot_count, model.dt)
