@@ -114,14 +114,14 @@ class _Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word."""
 
     joints: joint_rows.JointRows | None
-    joint_rows: tuple[joint.JointConstraint, ...]
+    joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
     close: compact.ClosePairs | None
 
     @property
     def rows(self) -> tuple[Rows, ...]:
-        return (*(group.rows for group in self.joint_rows), *(group.rows for group in self.contact_rows))
+        return (*self.joint_rows, *(group.rows for group in self.contact_rows))
 
 
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
@@ -137,7 +137,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     problem = _constrain(model, state, bodies, blocks, inertia, free, action)
     start = _warm_start(model, state, problem)
     solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
-    lever_sum = _lever_sum(problem, impulses, jnp.zeros_like(solved))
+    lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
@@ -193,15 +193,11 @@ def _constrain(
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
         middle = joint_rows.joint_rows(model, joint_rows.moved_by(bodies, 0.5 * model.dt))
-        motion = joint.JointMotion(
-            joints,
-            middle,
-            row_coefficients.row_coefficients(model, action),
-            inertia,
-            Side(blocks.velocity, blocks.angular_velocity),
-            Side(*free),
+        coefficients = row_coefficients.row_coefficients(model, action)
+        joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
+        tables = tuple(
+            joint.velocity_rows(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene)
         )
-        tables = tuple(joint.velocity_rows(scene, table, model, motion) for table in joint_layout.joint_tables(scene))
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
         found = []
@@ -236,8 +232,8 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
     start = [
-        joint.joint_impulse_start(group.rows.table, state.joint_force, model.dt, group.rows.bias.shape[-1])
-        for group in problem.joint_rows
+        joint.joint_impulse_start(rows.table, state.joint_force, model.dt, rows.bias.shape[-1])
+        for rows in problem.joint_rows
     ]
     if problem.contacts is not None:
         old, feature = vector(state.contact_force), state.contact_feature
@@ -266,11 +262,12 @@ def _gradient_iterations(scene: Scene, iterations: int) -> int:
     return scene.options.gradient_iterations or 2 * iterations
 
 
-def _lever_sum(problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
-    """Displacement caused by the impulses: joints hold for the whole step, stops and contacts as long as they last."""
-    groups = (*problem.joint_rows, *problem.contact_rows)
-    levers = tuple(impulse * group.lever for impulse, group in zip(impulses, groups, strict=True))
-    return pgs.add_impulses(problem.rows, zero, levers)
+def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
+    """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
+    count = len(problem.joint_rows)
+    halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
+    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
+    return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
 
 
 def _correct_positions(
@@ -286,7 +283,7 @@ def _correct_positions(
     if problem.joints is not None:
         error = joint_rows.joint_rows(model, _merge(scene, bodies, moved)).error
         rows += [
-            joint.position_rows(scene, group.rows.table, problem.joints, error, inertia) for group in problem.joint_rows
+            joint.position_rows(scene, group.table, problem.joints, error, inertia) for group in problem.joint_rows
         ]
     for group in problem.contact_rows:
         change = pgs.row_velocity(group.rows, packed)[:, :1]
@@ -326,7 +323,7 @@ def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> dic
     scene, count = model.scene, len(problem.joint_rows)
     changes: dict[str, Array] = {}
     if problem.joints is not None:
-        tables = [group.rows.table for group in problem.joint_rows]
+        tables = [rows.table for rows in problem.joint_rows]
         values = [impulse[:, 0] / model.dt for impulse in impulses[:count]]
         changes["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
     if problem.contacts is not None:

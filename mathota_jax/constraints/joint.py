@@ -24,13 +24,6 @@ from mathota_jax.solver.table import Table
 from mathota_jax.spatial.vector import where
 
 
-class JointConstraint(NamedTuple):
-    """Rows of one table, and the lever (turn, 1, column, world) of their impulses [s], see `contact`."""
-
-    rows: Rows
-    lever: Array
-
-
 class JointMotion(NamedTuple):
     """What the joint rows of a step are made of.
 
@@ -43,28 +36,21 @@ class JointMotion(NamedTuple):
       middle: rows at the middle of the step, whose Jacobians are used.
       coefficients: of the laws.
       inertia: of the moving bodies.
-      velocity, free: velocities of the moving bodies at the start and, unconstrained, at the end.
     """
 
     start: JointRows
     middle: JointRows
     coefficients: Coefficients
     inertia: Inertia
-    velocity: Side
-    free: Side
 
 
-def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> JointConstraint:
+def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
     """Rows of one table for the velocity solver."""
     jacobians, responses, mass = _sides(scene, table, motion.middle, motion.inertia)
     slots = np.maximum(table.order, 0)
     laws, curved, angular = (values[slots] for values in (motion.start.laws, motion.start.curved, motion.start.angular))
     error, rate, coefficients = select(table, (motion.start.error, motion.start.rate, motion.coefficients))
-    push = jnp.zeros(())
-    if STOP in laws:
-        for side, jacobian in enumerate(jacobians):
-            push = push + inner(jacobian, _difference(select_blocks(table, side, (motion.free, motion.velocity))))
-    columns = Columns(mass, error, rate, push, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
+    columns = Columns(mass, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
     found = {law: LAWS[law](columns) for law in sorted(set(laws.tolist()))}
 
     def of_each(name: str) -> Any:
@@ -84,17 +70,7 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
         lower=_pack_bound(table, of_each("lower"), worlds),
         upper=_pack_bound(table, of_each("upper"), worlds),
     )
-    lever = 0.5 * model.dt
-    if STOP in laws:
-        levers = {law: lever if response.lever is None else response.lever for law, response in found.items()}
-        lever = pack_scalars(table, [_by_law(laws, levers)], worlds)
-    return JointConstraint(_pack(table, jacobians, responses, bias, law, worlds), lever)
-
-
-def _difference(values: tuple[Side, Side]) -> Side:
-    end, start = values
-    assert end.angular is not None and start.angular is not None
-    return Side(end.linear - start.linear, end.angular - start.angular)
+    return _pack(table, jacobians, responses, bias, law, worlds)
 
 
 def _by_law(laws: np.ndarray, values: dict[str, Any]) -> Any:
@@ -128,7 +104,8 @@ def position_rows(scene: Scene, table: Table, joints: JointRows, error: Array, i
         lower=_bounds(table, np.where(one_sided, 0.0, -free)),
         upper=_bounds(table, free),
     )
-    bias = jnp.where(one_sided[:, None] & (error > 0), error, scene.options.position_percent * error)
+    # A stop is taken at once: there is no manifold whose points could fight over it.
+    bias = jnp.where(one_sided[:, None], error, scene.options.position_percent * error)
     return _pack(table, jacobians, responses, bias, law, worlds)
 
 

@@ -16,8 +16,6 @@ from jax import Array
 
 from mathota_jax.constraints.joints.rows import DRIVE, DRY, ELASTIC, HOLD, SERVO, STOP, VISCOUS
 from mathota_jax.constraints.oscillator import end_weight, oscillator_weights
-from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import settle
 
 LARGEST_DECAY = 30.0
 """Cap on damping * J M^-1 J^T * dt, beyond which the velocity left is below round-off of either precision."""
@@ -32,7 +30,6 @@ class Columns(NamedTuple):
     Attributes:
       mass: ``J M^-1 J^T``.
       error, rate: at the start of the step.
-      push: rate that the step's forces add, constraints excepted; read by stops only.
       angular: static, whether the error is an angle.
       coefficients: see `row_coefficients`.
       dt, baumgarte: time step; share of an error turned into velocity in a step.
@@ -41,7 +38,6 @@ class Columns(NamedTuple):
     mass: Array
     error: Array
     rate: Array
-    push: Array
     angular: np.ndarray
     coefficients: dict[str, Array]
     dt: Array
@@ -49,17 +45,13 @@ class Columns(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Coefficients of the solver's law, and the lever: the time [s] that the impulse has to act on the position.
-
-    `works` says where the row acts at all; the lever None stands for half a step.
-    """
+    """Coefficients of the solver's law; `works` says where the row acts at all."""
 
     bias: Array
     softness: Array | float = 0.0
     lower: Array | float = -math.inf
     upper: Array | float = math.inf
     works: Array | bool = True
-    lever: Array | None = None
 
 
 def _hold(columns: Columns) -> Response:
@@ -68,20 +60,14 @@ def _hold(columns: Columns) -> Response:
 
 
 def _stop(columns: Columns) -> Response:
-    """No further: without restitution, and without adding energy, as a contact (see `contact`).
+    """No further than the stop, without restitution.
 
-    Where the present rate reaches the stop within the step, the rate becomes 0 and the impulse acts from then on; else
-    the rate at the end may just close the room left, which changes by ``dt (start + end) / 2``.
+    The room left changes by ``dt (start + end) / 2``: the rate at the end may just close it, and is 0 where the present
+    rate would close it in less than half the step. What then is too far the position correction takes back, without
+    energy. (Impulses of a shorter lever, as contacts have, would part the joints that pass them on.)
     """
-    dt, start = columns.dt, columns.rate
     room = jnp.maximum(columns.error, 0.0)
-    hits = settle(jnp.where(room + start * dt <= 0, 1.0, 0.0) + jnp.where(columns.error <= 0, 1.0, 0.0)) > 0
-    time = jnp.clip(jnp.where(hits & (start < 0), room / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
-    bias = jnp.where(hits, 0.0, 2.0 * room / dt + start)
-    impact = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
-    # Share of the impulse that stops an approach at `time`; the rest holds the load, all through the step.
-    share = safe_divide(impact, impact + jnp.abs(columns.push))
-    return Response(bias, lower=0.0, lever=0.5 * dt + share * (0.5 * dt - time))
+    return Response(jnp.maximum(2.0 * room / columns.dt + columns.rate, 0.0), lower=0.0)
 
 
 def _viscous(columns: Columns) -> Response:
