@@ -40,6 +40,9 @@ SLIVER_ROUNDING = 256.0
 """The common normal must be lower than a side by this many round-offs of the size to be sampled before it."""
 FLAT_ROUNDING = 64.0
 """Three points whose angle is below this many round-offs span no face: their normal is noise."""
+SAME_ROUNDING = 16.0
+"""Points closer than this many round-offs of the size are the same: where they cross is noise, and a direction that
+leaves its triangle would leave a hole in the partition. What is passed over so is lower by no more than that."""
 
 
 class Penetration(NamedTuple):
@@ -150,7 +153,8 @@ def epa(
         )
 
     state = lax.while_loop(lambda s: (s.turn < limit) & ~jnp.all(s.done), advance, state)
-    return Penetration(state.direction, state.best, jnp.min(state.bounds, axis=0), heights[0])
+    lower = jnp.minimum(state.best, jnp.min(state.bounds, axis=0))  # the bounds leave out the sampled corners
+    return Penetration(state.direction, state.best, lower, heights[0])
 
 
 def _row(table: Array, index: Array) -> Array:
@@ -176,11 +180,12 @@ def _sample(shapes: Difference, direction: Vec3) -> tuple[Vec3, Array]:
 def _crossing(corners: tuple, points: tuple, i: int, j: int) -> tuple[Vec3, Array, Array]:
     """Where the functions of corners i and j are equal on the side between them: direction, bound, is it proper."""
     gap = points[j] - points[i]
-    # Both are non-negative, for each point is extreme at its own corner.
+    # Both are non-negative, for each point is extreme at its own corner; 0 where the points tie there.
     weight_i, weight_j = dot(gap, corners[j]), -dot(gap, corners[i])
     direction = corners[i] * weight_i + corners[j] * weight_j
     squared = dot(direction, direction)
-    proper = (weight_i > 0) & (weight_j > 0) & (squared > 0)
+    noise = SAME_ROUNDING * float(jnp.finfo(squared.dtype).eps)
+    proper = (weight_i > noise) & (weight_j > noise)
     bound = dot(points[i], direction) * lax.rsqrt(jnp.where(proper, squared, 1.0))
     return direction, jnp.where(proper, bound, jnp.inf), proper
 
@@ -201,7 +206,9 @@ def _least(corners: tuple, points: tuple) -> tuple[Array, Array]:
     edge, other = points[1] - points[0], points[2] - points[0]
     normal = cross(edge, other)
     squared = dot(normal, normal)
+    shortest = jnp.minimum(jnp.minimum(dot(edge, edge), dot(other, other)), dot(other - edge, other - edge))
     flat = squared <= (FLAT_ROUNDING * eps) ** 2 * dot(edge, edge) * dot(other, other)
+    flat |= shortest <= (SAME_ROUNDING * eps) ** 2
     weights = [dot(normal, cross(corners[i], corners[j])) for i, j in ((1, 2), (2, 0), (0, 1))]
     positive = (weights[0] > 0) & (weights[1] > 0) & (weights[2] > 0)
     negative = (weights[0] < 0) & (weights[1] < 0) & (weights[2] < 0)
