@@ -20,13 +20,19 @@ from mathota_jax.spatial.vector import Vec3, dot, norm
 POLYTOPE_ITERATIONS = 16
 CURVED_ITERATIONS = {"float32": 24, "float64": 40}
 """Most iterations of the distance search."""
-GLANCE, PROOF = 12, 64
+GLANCE, POLYTOPE_PROOF, CURVED_PROOF = 24, 64, 110
 """Most iterations of the penetration search: of the first, which looks for a seed, and of those that prove it."""
-PROOFS = 2
-"""Proofs in a row: the second starts from what the first one found in place of its seed."""
-LIFT = 0.1
+PROOFS = 3
+"""Proofs in a row: each starts from what the one before found in place of its seed."""
+LIFT = 0.01
 """Overlapping shapes are pulled apart, along the direction of least overlap, to this gap (share of the size): their
 closest points are then those of the overlap, and the distance search finds the pieces they lie on."""
+LIFT_RATIO = {"float32": 0.3, "float64": 0.01}
+"""Each later search lifts less: from a direction that is no minimum yet the answer moves the further the lower the lift,
+while its rounding grows."""
+CLOSE = 1e-3
+"""Shapes that are apart by less than this share of the size are searched like overlapping ones if the distance search
+fails to prove its answer; further apart the polish repairs it."""
 PROVED = {"float32": (1e-5, 1e-5), "float64": (1e-10, 5e-7)}
 """A separation counts as converged if it is proved to this share of the size: polytopes; pairs with a cylinder or cone,
 where the bounds of the search approach each other slowly while the answer is exact long before."""
@@ -98,6 +104,8 @@ class _Search(NamedTuple):
     simplex: Simplex
     start: Vec3
     shift: Vec3
+    lift: Array
+    overlap: Array
     upper: Array
     done: Array
 
@@ -110,26 +118,33 @@ def _search(shapes: Difference) -> tuple[Simplex, Array]:
     turns of one loop, so that they are compiled once.
     """
     number = shapes.position.x.dtype
-    curved = _curved(shapes)
+    curved, tolerance = _curved(shapes), _tolerance(shapes)
     iterations = CURVED_ITERATIONS[str(number)] if curved else POLYTOPE_ITERATIONS
+    proof = CURVED_PROOF if curved else POLYTOPE_PROOF
 
     def turn(index: Array, state: _Search) -> _Search:
         found = gjk(shapes, state.start, state.shift, ~state.done, iterations)
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), found, state.simplex)
-        overlap = jnp.where(index == 0, found.overlap, ~state.done)
-        limit = jnp.where(index == 0, GLANCE, jnp.where(index <= PROOFS, PROOF, 0))
-        least = epa(shapes, simplex.direction, overlap, limit, PROOF, _tolerance(shapes))
+        first = index == 0
         apart = norm(found.point_b - found.point_a)
-        upper = jnp.where(overlap, jnp.minimum(state.upper, -least.lower), jnp.where(index == 0, apart, state.upper))
-        # The seed of the first turn is none: a lane that is done keeps the simplex of its seed.
-        done = ~overlap | ((index > 0) & (least.lower >= least.seed_depth - _tolerance(shapes)))
-        return _Search(simplex, least.direction, least.direction * (least.depth + LIFT), upper, done)
+        # Close to touch the distance search may stall on a needle of a simplex: it proves nothing about the direction.
+        stalled = (apart < CLOSE) & (dot(found.direction, shapes.least(found.direction)[0]) < apart - tolerance)
+        overlap = jnp.where(first, found.overlap, state.overlap)
+        wanted = jnp.where(first, found.overlap | stalled, ~state.done)
+        limit = jnp.where(first, GLANCE, jnp.where(index <= PROOFS, proof, 0))
+        least = epa(shapes, simplex.direction, wanted, limit, proof, tolerance)
+        upper = jnp.where(first, jnp.where(overlap, jnp.inf, apart), state.upper)
+        upper = jnp.where(overlap & wanted, jnp.minimum(upper, -least.lower), upper)
+        # The first seed is none. Later a lane that is done keeps the simplex of its seed.
+        done = ~wanted | (~first & (least.lower >= least.seed_depth - tolerance))
+        lift = state.lift * LIFT_RATIO[str(number)]
+        return _Search(simplex, least.direction, least.direction * (least.depth + state.lift), lift, overlap, upper, done)
 
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
     none = jnp.zeros(zero.shape, jnp.int32)
     simplex = Simplex(vector, (none, none, none), vector, vector, none < 0, none < 0)
-    state = _Search(simplex, shapes.position, vector, zero + jnp.inf, none < 0)
+    state = _Search(simplex, shapes.position, vector, jnp.asarray(LIFT, number), none < 0, zero + jnp.inf, none < 0)
     state = lax.fori_loop(0, PROOFS + 2, turn, state)
     return state.simplex, state.upper
 
