@@ -20,9 +20,9 @@ from mathota_jax.spatial.vector import Vec3, dot, norm
 POLYTOPE_ITERATIONS = 16
 CURVED_ITERATIONS = {"float32": 24, "float64": 40}
 """Most iterations of the distance search."""
-GLANCE, POLYTOPE_PROOF, CURVED_PROOF = 24, 64, 110
+GLANCE, POLYTOPE_PROOF, CURVED_PROOF = 16, 48, 64
 """Most iterations of the penetration search: of the first, which looks for a seed, and of those that prove it."""
-PROOFS = 3
+PROOFS = 2
 """Proofs in a row: each starts from what the one before found in place of its seed."""
 LIFT = 0.01
 """Overlapping shapes are pulled apart, along the direction of least overlap, to this gap (share of the size): their
@@ -138,7 +138,9 @@ def _search(shapes: Difference) -> tuple[Simplex, Array]:
         # The first seed is none. Later a lane that is done keeps the simplex of its seed.
         done = ~wanted | (~first & (least.lower >= least.seed_depth - tolerance))
         lift = state.lift * LIFT_RATIO[str(number)]
-        return _Search(simplex, least.direction, least.direction * (least.depth + state.lift), lift, overlap, upper, done)
+        return _Search(
+            simplex, least.direction, least.direction * (least.depth + state.lift), lift, overlap, upper, done
+        )
 
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
