@@ -216,7 +216,7 @@ def oracle(placed, tolerance=1e-10):
         if normal @ point >= gap - tolerance:
             return placed.reach(normal), normal
         points.append(point)
-    if set(kind for kind, *_ in placed.sides) <= set(ROUND):  # the cores, points or segments, meet: all normals across
+    if {kind for kind, *_ in placed.sides} <= set(ROUND):  # the cores, points or segments, meet: all normals across
         normal = np.linalg.svd(np.array(points))[2][-1]
         return placed.reach(normal), normal
     hull = ConvexHull(np.array(points), incremental=True)

@@ -27,6 +27,7 @@ from tests.convex_oracle import (
     rounded,
     to_engine,
 )
+from tests.hulls import BOX_CORNERS
 
 QUICK = [("box", "polyhedron"), ("cylinder", "cone")]
 """Pairs of the normal suite; the slow one runs them all."""
@@ -162,7 +163,7 @@ def degenerate_scene(pair):
     ]
     table = list(itertools.product(offsets, turns))
     count = len(table)
-    cube = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    cube = 0.5 * BOX_CORNERS
     shapes = {
         "radius": np.full(count, 0.5), "half_height": np.full(count, 0.5), "half_extents": np.full((count, 3), 0.5),
         "vertices": np.tile(np.vstack([cube, cube[:1]]), (count, 1, 1)),  # one vertex repeated, as padding does
