@@ -82,7 +82,7 @@ def test_what_is_not_flagged_is_right(pair, kind, precision):
     result = measure(pair, sweep(pair, kind, NORMAL_COUNT, precision), precision)
     wrong = ~(np.maximum(result["separation"], result["normal"]) <= error_gate(pair, precision))
     assert not (wrong & result["converged"]).any()
-    assert result["converged"].mean() > (0.7 if kind.startswith("needles") else 0.95)
+    assert result["converged"].mean() >= (0.7 if kind.startswith("needles") else 0.9)
 
 
 @pytest.mark.slow

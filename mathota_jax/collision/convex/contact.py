@@ -20,7 +20,7 @@ from mathota_jax.spatial.vector import Vec3, dot, norm
 POLYTOPE_ITERATIONS = 16
 CURVED_ITERATIONS = {"float32": 24, "float64": 40}
 """Most iterations of the distance search."""
-GLANCE, POLYTOPE_PROOF, CURVED_PROOF = 16, 48, 64
+GLANCE, POLYTOPE_PROOF, CURVED_PROOF = 16, 48, 110
 """Most iterations of the penetration search: of the first, which looks for a seed, and of those that prove it."""
 PROOFS = 2
 """Proofs in a row: each starts from what the one before found in place of its seed."""
@@ -135,8 +135,8 @@ def _search(shapes: Difference) -> tuple[Simplex, Array]:
         least = epa(shapes, simplex.direction, wanted, limit, proof, tolerance)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, apart), state.upper)
         upper = jnp.where(overlap & wanted, jnp.minimum(upper, -least.lower), upper)
-        # The first seed is none. Later a lane that is done keeps the simplex of its seed.
-        done = ~wanted | (~first & (least.lower >= least.seed_depth - tolerance))
+        # The first seed is none. Later a lane keeps the simplex of its seed unless the search found a better direction.
+        done = ~wanted | (~first & (least.depth >= least.seed_depth - tolerance))
         lift = state.lift * LIFT_RATIO[str(number)]
         return _Search(
             simplex, least.direction, least.direction * (least.depth + state.lift), lift, overlap, upper, done
