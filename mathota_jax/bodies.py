@@ -63,6 +63,14 @@ class Bodies(NamedTuple):
     angular_velocity: Vec3
 
 
+class Edges(NamedTuple):
+    """Connections of bodies: handles `first` and `second`, and whether each exists; all of shape (edge, world or 1)."""
+
+    first: Array
+    second: Array
+    active: Array
+
+
 def vector(array: Array) -> Vec3:
     """Components of an (element, 3, world) array."""
     return Vec3(*unstack(array, 1))

@@ -23,7 +23,7 @@ from mathota_jax.options import Options
 from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate, rotate_back
 from mathota_jax.scene import JointEntry, PairGroup, Scene, ShapeEntry
 from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
-from mathota_jax.state import State
+from mathota_jax.state import Sleep, State
 
 
 class SceneBuilder:
@@ -274,9 +274,11 @@ class SceneBuilder:
 
     def _state(self, scene: Scene) -> State:
         bodies = self._bodies
+        position = _floats([body.position for body in bodies])
+        orientation = _floats([body.orientation for body in bodies])
         return State(
-            position=_floats([body.position for body in bodies]),
-            orientation=_floats([body.orientation for body in bodies]),
+            position=position,
+            orientation=orientation,
             velocity=_floats([body.velocity for body in bodies]),
             angular_velocity=_floats([body.angular_velocity for body in bodies]),
             applied_force=_floats(np.zeros((len(bodies), 3))),
@@ -286,6 +288,13 @@ class SceneBuilder:
             joint_force=_floats(np.zeros(joint_row_count(scene))),
             flags=jnp.zeros((), jnp.int32),
             contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
+            sleep=Sleep(
+                time=_floats(np.zeros(len(bodies))),
+                asleep=jnp.zeros(len(bodies), bool),
+                pose=jnp.concatenate([position, orientation], axis=1),
+            )
+            if scene.options.sleep
+            else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:

@@ -22,8 +22,9 @@ from mathota_jax.bodies import (
     vector,
 )
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
-from mathota_jax.constraints import compact, contact, joint, warm_start
+from mathota_jax.constraints import compact, contact, graph, joint, warm_start
 from mathota_jax.constraints.assembly import Side, collect
+from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
@@ -66,6 +67,11 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
         raise ValueError(
             f"step: state.position must have shape ({scene.body_count}, 3) for this model, got {state.position.shape}; "
             "use jax.vmap for several worlds"
+        )
+    if (state.sleep is not None) != scene.options.sleep:
+        raise ValueError(
+            f"step: the model was built with Options(sleep={scene.options.sleep}), the state was not; take both from one "
+            "call of build"
         )
     return _batched_step(model, state, action)
 
@@ -117,6 +123,25 @@ class _Problem(NamedTuple):
 
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
     """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this."""
+    if not (model.scene.options.sleep and model.scene.dynamic_bodies):
+        return _simulate(model, state, action)
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))
+
+    def every_world(state: State) -> State:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), state)
+
+    return jax.lax.cond(
+        sleep.all_rest(model.scene, state, action),
+        lambda model, state, action: every_world(sleep.at_rest(state)),
+        lambda model, state, action: every_world(_simulate(model, state, action)),
+        model,
+        state,
+        action,
+    )
+
+
+def _simulate(model: Model, state: State, action: Array) -> State:
+    """The phases of a step."""
     scene = model.scene
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
@@ -132,7 +157,8 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
-    return _finish(scene, state, moved, _forces(model, problem, impulses))
+    new = _finish(scene, state, moved, _forces(model, problem, impulses))
+    return _let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
 
 _batched_step = batch_last(step_worlds_last)
@@ -283,6 +309,13 @@ def _correct_positions(
 def _merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:
     """All bodies, the moving ones at their new place."""
     return jax.tree.map(lambda old, new: _place(scene, old[:, None], [new])[:, 0], bodies, moved)
+
+
+def _let_sleep(model: Model, old: State, new: State, action: Array, problem: _Problem) -> State:
+    """Phase 8: islands fall asleep and wake (guide 3.4 and 12.2)."""
+    edges = graph.body_graph(model, old, new, problem.contacts, problem.close)
+    new, sleepers = sleep.let_sleep(model, old, new, action, edges)
+    return dataclasses.replace(new, **graph.keep_forces(model, old, new, problem.close, sleepers))
 
 
 def _place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:

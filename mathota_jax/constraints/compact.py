@@ -152,6 +152,37 @@ def matched_force(
     return parts
 
 
+def carried(
+    scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array
+) -> tuple[Array, Array]:
+    """Forces (slot, 3, world) and features (slot, world) of the last step in the slots where their pairs are now.
+
+    Args:
+      scene, close: static structure, and what is close in this step.
+      force, feature, pair: what the state keeps: (slot, 3, world), (slot, world) and (place, world).
+    """
+    previous = _previous_places(scene, close.found, pair)
+    own = range(scene.static_slot_count)
+    forces, features = [take(force, own)] if own else [], [take(feature, own)] if own else []
+    slot, place = scene.static_slot_count, 0
+    for group, p in zip(scene.compact_groups, close.groups, strict=True):
+        source = gather(previous, p.listed) - place
+        known = p.active & (source >= 0) & (source < group.place_count)
+        points = jnp.arange(group.point_count, dtype=jnp.int32)[None, :, None]
+        slots = slot + jnp.clip(source, 0, group.place_count - 1)[:, None] * group.point_count + points
+        slots = slots.reshape(group.slot_count, -1)
+        known = jnp.repeat(known, group.point_count, axis=0)
+        forces.append(jnp.where(known[:, None], gather(force, slots), 0.0))
+        features.append(jnp.where(known, gather(feature, slots), NO_PAIR))
+        slot, place = slot + group.slot_count, place + group.place_count
+    worlds = max(values.shape[-1] for values in (*forces, *features))
+
+    def join(parts: list[Array]) -> Array:
+        return jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in parts])
+
+    return join(forces), join(features)
+
+
 def _key(scene: Scene, first: Array, second: Array) -> Array:
     assert scene.broadphase is not None
     return first * len(scene.broadphase.shapes) + second
