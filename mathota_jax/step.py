@@ -50,7 +50,10 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
       action: (motor,) one entry for each motor, clipped to its limit; None for no effort.
 
     Returns:
-      State at the end of the step; applied forces are cleared.
+      State at the end of the step; applied forces are cleared. With a `model.dt` of 0 no time passes and the state comes
+      back as it was, applied forces included; with one that is negative or not finite likewise, and
+      `Flag.INVALID_TIME_STEP` is set. Bodies that sleep (`Options.sleep`) keep their pose, of which the derivative is the
+      identity; that of their velocities is 0.
 
     Raises:
       ValueError: the action has the wrong shape, or a state of another scene was given.
@@ -123,6 +126,16 @@ class _Problem(NamedTuple):
 
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
     """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this."""
+    runs = (model.dt > 0) & (model.dt < jnp.inf)
+    # The program must stay finite for the derivative of the selection to be 0.
+    new = _simulate_or_rest(dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0)), state, action)
+    new = jax.tree.map(lambda before, after: jnp.where(runs, after, before), state, new)
+    bad = jnp.where(runs | (model.dt == 0), 0, int(Flag.INVALID_TIME_STEP))
+    return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype))
+
+
+def _simulate_or_rest(model: Model, state: State, action: Array) -> State:
+    """`_simulate`, but for batches in which everything sleeps."""
     if not (model.scene.options.sleep and model.scene.dynamic_bodies):
         return _simulate(model, state, action)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))

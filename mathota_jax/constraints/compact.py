@@ -152,9 +152,7 @@ def matched_force(
     return parts
 
 
-def carried(
-    scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array
-) -> tuple[Array, Array]:
+def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array) -> tuple[Array, Array]:
     """Forces (slot, 3, world) and features (slot, world) of the last step in the slots where their pairs are now.
 
     Args:

@@ -48,13 +48,17 @@ def body_graph(
         return Edges(none, none, none > 0)
     worlds = max(field.shape[-1] for part in parts for field in part)
     return Edges(
-        *(jnp.concatenate([jnp.broadcast_to(x, (x.shape[0], worlds)) for x in fields]) for fields in zip(*parts, strict=True))
+        *(
+            jnp.concatenate([jnp.broadcast_to(x, (x.shape[0], worlds)) for x in fields])
+            for fields in zip(*parts, strict=True)
+        )
     )
 
 
 def _joint_edges(scene: Scene) -> Edges:
     parent, child = (
-        jnp.asarray([getattr(entry, side) for entry in scene.joints], jnp.int32)[:, None] for side in ("parent", "child")
+        jnp.asarray([getattr(entry, side) for entry in scene.joints], jnp.int32)[:, None]
+        for side in ("parent", "child")
     )
     return Edges(parent, child, jnp.ones(parent.shape, bool))
 
