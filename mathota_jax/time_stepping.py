@@ -14,10 +14,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.model import Model
-from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize
-from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.quaternion import Quaternion, exponential, logarithm, multiply, normalize
 from mathota_jax.spatial.settle import settle
-from mathota_jax.spatial.vector import Vec3, dot
 from mathota_jax.state import Flag, State
 from mathota_jax.step import step
 
@@ -151,23 +149,12 @@ def interpolate(previous: State, current: State, alpha: Any) -> State:
     start = Quaternion(*jnp.moveaxis(previous.orientation, -1, 0))
     end = Quaternion(*jnp.moveaxis(current.orientation, -1, 0))
     turn = multiply(end, Quaternion(start.w, -start.x, -start.y, -start.z))
-    turned = normalize(multiply(exponential(_logarithm(turn) * alpha), start))
+    turned = normalize(multiply(exponential(logarithm(turn) * alpha), start))
     return dataclasses.replace(
         current,
         position=previous.position + alpha * (current.position - previous.position),
         orientation=jnp.stack(list(turned), axis=-1),
     )
-
-
-def _logarithm(q: Quaternion) -> Vec3:
-    """Rotation vector of a unit quaternion, the short way round; smooth at no rotation."""
-    sign = jnp.where(q.w < 0, -1.0, 1.0)
-    axis = Vec3(q.x * sign, q.y * sign, q.z * sign)
-    sine = safe_sqrt(dot(axis, axis))
-    # Below, the quotient is 2 to the round-off of either precision.
-    small = sine < jnp.sqrt(jnp.finfo(sine.dtype).eps)
-    angle = 2.0 * jnp.arctan2(jnp.where(small, 1.0, sine), q.w * sign)
-    return axis * jnp.where(small, 2.0, safe_divide(angle, jnp.where(small, 1.0, sine)))
 
 
 def _positive_integer(label: str, value: Any) -> None:

@@ -67,6 +67,7 @@ class ContactRows(NamedTuple):
       directions: row directions in the world frame, components (turn * column, world).
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.
+      size: (turn, 1, column, world) inner radius of the smaller moving body.
     """
 
     rows: Rows
@@ -74,6 +75,7 @@ class ContactRows(NamedTuple):
     directions: tuple[Vec3, ...]
     separation: Array
     slop: Array
+    size: Array
 
 
 class PlacedPairs(NamedTuple):
@@ -164,14 +166,15 @@ def contact_rows(
         table=table,
         places=places,
     )
-    slop = scene.options.slop * _smallest_size(scene, table, model, places)
+    size = pack_scalars(table, [_smallest_size(scene, table, model, places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     return ContactRows(
         rows,
         pack_scalars(table, [lever], worlds),
         directions,
         pack_scalars(table, [separation], worlds),
-        pack_scalars(table, [slop], worlds),
+        scene.options.slop * size,
+        size,
     )
 
 
@@ -362,7 +365,11 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
       percent: share of the overlap beyond the slop that is corrected.
     """
     rows = contact.rows
-    error = contact.separation + displacement + contact.slop
+    # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never that
+    # the overlap went beyond the body's middle.
+    error = (
+        jnp.maximum(contact.separation + displacement, jnp.minimum(contact.separation, -contact.size)) + contact.slop
+    )
     mass = rows.law.normal_mass[:, None] if isinstance(rows.law, Cone) else rows.law.effective_mass
     return Rows(
         jacobian=tuple(side[:, :1] for side in rows.jacobian),

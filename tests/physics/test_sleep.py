@@ -86,7 +86,7 @@ def test_a_world_asleep_does_not_change_a_bit(precision):
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(later), strict=True):
         np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
     force = np.asarray(state.contact_force, dtype=float)
-    assert force[:, 1].max() > GRAVITY, "the boxes below carry more than one weight"
+    assert force[:, 1].max() > 0.7 * GRAVITY, "the lowest box stands on four points with three weights"
 
 
 def test_the_whole_island_sleeps_at_once():
@@ -230,10 +230,10 @@ def test_sleep_is_absent_unless_asked_for():
     assert not np.asarray(is_asleep(model, state)).any()
     assert wake(state, 1) is state
     # Thresholds are static: were they in the program, another value would be another program.
-    programs = [
-        jax.jit(step).lower(*sphere_on_plane(options=undamped(dt=DT, sleep_time=seconds))).as_text()
-        for seconds in (0.5, 0.7)
-    ]
+    programs = []
+    for seconds in (0.5, 0.7):
+        model, state = sphere_on_plane(options=undamped(dt=DT, sleep_time=seconds))
+        programs.append(jax.jit(step).lower(model, state).as_text())
     assert programs[0] == programs[1]
     assert programs[0] != jax.jit(step).lower(*sphere_on_plane(options=sleepy())).as_text()
 
