@@ -93,6 +93,13 @@ def moving(scene: Scene, bodies: Bodies) -> Bodies:
     return take(bodies, scene.dynamic_bodies)
 
 
+def of_all_bodies(scene: Scene, blocks: Vec3) -> Vec3:
+    """Values of all bodies from those of the moving ones; 0 for the static ones."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    index = [block_of.get(body, len(block_of)) for body in range(scene.body_count)]
+    return take(blocks.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])), index)
+
+
 def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inertia:
     """Mass properties of the moving bodies at the given orientations."""
     mass, moments = take((model.mass, vector(model.inertia)), scene.dynamic_bodies)

@@ -215,6 +215,10 @@ class SceneBuilder:
             sorted(joined),
             options,
         )
+        if broadphase and options.continuous:
+            raise ValueError(
+                'build: Options.continuous follows pairs that have contact slots of their own; pass broadphase="none"'
+            )
         groups = self._pair_groups(table, frozenset(broadphase.shapes) if broadphase else frozenset())
         pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
         if broadphase:

@@ -97,6 +97,7 @@ def _features(scene: Scene) -> list[str]:
         "angular damping": options.angular_damping > 0,
         "warm start": options.warm_start,
         "position correction": options.position_iterations > 0,
+        "continuous collision": options.continuous,
         "sleep": options.sleep,
     }
     return [

@@ -17,6 +17,7 @@ from mathota_jax.bodies import (
     Inertia,
     moving,
     moving_inertia,
+    of_all_bodies,
     pack_blocks,
     unpack,
     vector,
@@ -24,7 +25,7 @@ from mathota_jax.bodies import (
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
 from mathota_jax.constraints import compact, contact, graph, joint, warm_start
 from mathota_jax.constraints.assembly import Side, collect
-from mathota_jax.dynamics import sleep
+from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
@@ -170,6 +171,8 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
+    if scene.options.continuous and scene.pair_groups:
+        moved = _stop_at_impacts(model, bodies, moved, displacement)
     new = _finish(scene, state, moved, _forces(model, problem, impulses))
     return _let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
@@ -317,6 +320,13 @@ def _correct_positions(
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
     return displace(moved, correction)
+
+
+def _stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:
+    """Fast bodies stop at the first touch on their way (guide 10.4)."""
+    scene = model.scene
+    motion = events.Motion(bodies.position, bodies.orientation, *(of_all_bodies(scene, part) for part in displacement))
+    return moving(scene, events.stop_at_impacts(model, motion, _merge(scene, bodies, moved)))
 
 
 def _merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.bodies import Bodies
+from mathota_jax.bodies import Bodies, of_all_bodies
 from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.broadphase.ranges import lower_bound
@@ -75,7 +75,7 @@ def close_pairs(model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None) ->
     displacements: tuple[Vec3, ...] = ()
     turn = None
     if free is not None:
-        linear, angular = (_of_all_bodies(scene, v) for v in free)
+        linear, angular = (of_all_bodies(scene, v) for v in free)
         displacements = (bodies.velocity * model.dt, linear * model.dt)
         if _turns_matter(scene, model):
             turn = jnp.maximum(norm(bodies.angular_velocity), norm(angular)) * model.dt
@@ -83,13 +83,6 @@ def close_pairs(model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None) ->
     found = candidate_pairs(plan.method, bounds, admissible_pairs(scene), plan.capacity)
     groups, lost = _places(scene, found)
     return ClosePairs(found, groups, found.overflow | lost)
-
-
-def _of_all_bodies(scene: Scene, blocks: Vec3) -> Vec3:
-    """Values of all bodies from those of the moving ones; 0 for the static ones."""
-    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
-    index = [block_of.get(body, len(block_of)) for body in range(scene.body_count)]
-    return take(blocks.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])), index)
 
 
 def _turns_matter(scene: Scene, model: Model) -> bool:

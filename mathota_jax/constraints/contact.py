@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Inertia
-from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
     Side,
     collect,
@@ -122,6 +122,10 @@ def contact_rows(
     """Rows of the contacts in one table; `pairs` are those of a traced table."""
     places = None if pairs is None else pairs.places
     chosen: ContactSet = select(table, contacts)
+    smallest = _smallest_size(scene, table, model, places)
+    if scene.options.continuous:
+        near = settle(jnp.where(chosen.separation <= SPECULATIVE * smallest, 1.0, 0.0)) > 0.5
+        chosen = chosen._replace(active=chosen.active & near)
     worlds = max(
         chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1]
     )
@@ -166,7 +170,7 @@ def contact_rows(
         table=table,
         places=places,
     )
-    size = pack_scalars(table, [_smallest_size(scene, table, model, places)], worlds)
+    size = pack_scalars(table, [smallest], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     return ContactRows(
         rows,
