@@ -116,7 +116,7 @@ def _slots(model: Model, state: State, bodies: Bodies) -> _Slots:
     if close is not None:
         assert state.contact_pair is not None
         forces += compact.matched_force(scene, close, contacts, old, feature, state.contact_pair)
-    return _Slots(contacts, *sides, warm_start.join_forces(forces))
+    return _Slots(contacts, sides[0], sides[1], warm_start.join_forces(forces))
 
 
 @batch_last
