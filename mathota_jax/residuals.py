@@ -138,7 +138,7 @@ def _residuals(model: Model, state: State) -> Residuals:
     limit = coefficient * normal_impulse
 
     def largest(values: Array) -> Array:
-        return jnp.max(jnp.where(slots.contacts.active, values, 0.0), axis=0)
+        return jnp.max(jnp.where(slots.contacts.active, values, 0.0), axis=0, initial=0.0)
 
     return Residuals(
         complementarity=largest(jnp.abs(normal_impulse * normal_velocity)),

@@ -238,6 +238,8 @@ def _constrain(
                 state.position,
             )
         )
+        if scene.options.continuous:
+            contacts = contact.near_contacts(scene, model, contacts)
         motion = contact.Motion(
             blocks.position, Side(blocks.velocity, blocks.angular_velocity), Side(*free), inertia, _gravity(model)
         )

@@ -111,6 +111,16 @@ def couples_rotation(scene: Scene) -> bool:
     return scene.friction or bool(scene.joints) or not kinds <= {"plane", "sphere"}
 
 
+def near_contacts(scene: Scene, model: Model, contacts: ContactSet) -> ContactSet:
+    """The contacts without those so far ahead that they are left to the search along the motion (`SPECULATIVE`)."""
+    sizes = [
+        jnp.where(np.asarray(scene.static)[np.asarray(side)][:, None], jnp.inf, take(model.size, side))
+        for side in scene.slot_bodies
+    ]
+    near = settle(jnp.where(contacts.separation <= SPECULATIVE * jnp.minimum(*sizes), 1.0, 0.0)) > 0.5
+    return contacts._replace(active=contacts.active & near)
+
+
 def contact_rows(
     scene: Scene,
     table: Table | TracedTable,
@@ -122,10 +132,6 @@ def contact_rows(
     """Rows of the contacts in one table; `pairs` are those of a traced table."""
     places = None if pairs is None else pairs.places
     chosen: ContactSet = select(table, contacts)
-    smallest = _smallest_size(scene, table, model, places)
-    if scene.options.continuous:
-        near = settle(jnp.where(chosen.separation <= SPECULATIVE * smallest, 1.0, 0.0)) > 0.5
-        chosen = chosen._replace(active=chosen.active & near)
     worlds = max(
         chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1]
     )
@@ -170,7 +176,7 @@ def contact_rows(
         table=table,
         places=places,
     )
-    size = pack_scalars(table, [smallest], worlds)
+    size = pack_scalars(table, [_smallest_size(scene, table, model, places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     return ContactRows(
         rows,
