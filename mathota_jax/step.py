@@ -25,6 +25,7 @@ from mathota_jax.bodies import (
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
 from mathota_jax.constraints import compact, contact, graph, joint, warm_start
 from mathota_jax.constraints.assembly import Side, collect
+from mathota_jax.constraints.lever import levers
 from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
@@ -165,10 +166,11 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     force, torque = _external(model, state, bodies, action)
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = _constrain(model, state, bodies, blocks, inertia, free)
-    start = _warm_start(model, state, problem)
-    solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
-    lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
-    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
+    packed = _pack(scene, *free)
+    start = _warm_start(model, state, problem, inertia, packed)
+    solved, impulses = _solve(scene, problem, packed, start)
+    lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
+    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
@@ -254,7 +256,7 @@ def _constrain(
     return _Problem(joints, joint_rows, contacts, contact_rows, close)
 
 
-def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, ...]:
+def _warm_start(model: Model, state: State, problem: _Problem, inertia: Inertia, velocity: Array) -> tuple[Array, ...]:
     """Impulses to start from: those of the last step where rows and features are the same (guide 12.4)."""
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
@@ -271,6 +273,8 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
             )
         force = compute_once(warm_start.join_forces(parts), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
+        if len(model.scene.dynamic_bodies) > 1:
+            return warm_start.plausible(problem.rows, inertia, velocity, tuple(start))
     return tuple(start)
 
 
@@ -287,14 +291,6 @@ def _solve(
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
     return scene.options.gradient_iterations or 2 * iterations
-
-
-def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
-    """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
-    count = len(problem.joint_rows)
-    halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
-    return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
 
 
 def _correct_positions(
@@ -321,7 +317,7 @@ def _correct_positions(
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
-    return displace(moved, correction)
+    return displace(moved, inertia, correction)
 
 
 def _stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:
