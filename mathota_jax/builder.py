@@ -23,7 +23,7 @@ from mathota_jax.options import Options
 from mathota_jax.rotation import rotate
 from mathota_jax.scene import JointEntry, MotorEntry, PairGroup, Scene, ShapeEntry
 from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
-from mathota_jax.state import State
+from mathota_jax.state import Sleep, State
 
 
 class SceneBuilder:
@@ -207,6 +207,10 @@ class SceneBuilder:
             sorted(joined),
             options,
         )
+        if broadphase and options.continuous:
+            raise ValueError(
+                'build: Options.continuous follows pairs that have contact slots of their own; pass broadphase="none"'
+            )
         groups = self._pair_groups(table, frozenset(broadphase.shapes) if broadphase else frozenset())
         pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
         if broadphase:
@@ -274,9 +278,11 @@ class SceneBuilder:
 
     def _state(self, scene: Scene) -> State:
         bodies = self._bodies
+        position = _floats([body.position for body in bodies])
+        orientation = _floats([body.orientation for body in bodies])
         return State(
-            position=_floats([body.position for body in bodies]),
-            orientation=_floats([body.orientation for body in bodies]),
+            position=position,
+            orientation=orientation,
             velocity=_floats([body.velocity for body in bodies]),
             angular_velocity=_floats([body.angular_velocity for body in bodies]),
             applied_force=_floats(np.zeros((len(bodies), 3))),
@@ -286,6 +292,13 @@ class SceneBuilder:
             joint_force=_floats(np.zeros(joint_row_count(scene))),
             flags=jnp.zeros((), jnp.int32),
             contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
+            sleep=Sleep(
+                time=_floats(np.zeros(len(bodies))),
+                asleep=jnp.zeros(len(bodies), bool),
+                pose=jnp.concatenate([position, orientation], axis=1),
+            )
+            if scene.options.sleep
+            else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:

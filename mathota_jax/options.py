@@ -35,6 +35,18 @@ class Options:
         "sort_and_sweep", "grid", "bvh". Guide 5.4.
       pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
+      continuous: check the motion of fast bodies for what they meet on their way and stop them at the first touch, to be
+        handled in the next step. Off: absent; contacts found at the start of a step are then extrapolated over it, which
+        is exact for bodies that hit what they head for, but lets fast turning ones slip through and stops others at what
+        they would have passed. Guide 10.4.
+      sleep: let islands of bodies at rest sleep until something disturbs them; off: absent. Guide 3.4 and 12.2. A body
+        asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing.
+      sleep_velocity: speed below which a body may be at rest [m/s]. Guide 11.3. It belongs to things about a metre long
+        under the gravity of the Earth: in other scenes it should grow with the square root of length times gravity.
+      sleep_angular_velocity: angular speed below which a body may be at rest [rad/s]; grows with the square root of
+        gravity over length.
+      sleep_time: how long all bodies of an island must be at rest before it sleeps [s]; grows with the square root of
+        length over gravity.
     """
 
     dt: float = 1 / 60
@@ -49,6 +61,11 @@ class Options:
     broadphase: str = "auto"
     pair_capacity: int | None = None
     gradient_iterations: int | None = None
+    continuous: bool = False
+    sleep: bool = False
+    sleep_velocity: float = 0.05
+    sleep_angular_velocity: float = 0.05
+    sleep_time: float = 0.5
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and self.dt > 0):
@@ -66,8 +83,14 @@ class Options:
             value = getattr(self, name)
             if not (_is_number(value) and 0 <= value <= 1):
                 raise ValueError(f"Options.{name} must lie between 0 and 1, got {value!r}")
-        if not isinstance(self.warm_start, bool):
-            raise ValueError(f"Options.warm_start must be True or False, got {self.warm_start!r}")
+        for name in ("sleep_velocity", "sleep_angular_velocity", "sleep_time"):
+            value = getattr(self, name)
+            if not (_is_number(value) and value > 0):
+                raise ValueError(f"Options.{name} must be a positive finite number, got {value!r}")
+        for name in ("warm_start", "continuous", "sleep"):
+            value = getattr(self, name)
+            if not isinstance(value, bool):
+                raise ValueError(f"Options.{name} must be True or False, got {value!r}")
         if self.broadphase not in BROADPHASE_CHOICES:
             known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
             raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")

@@ -24,6 +24,24 @@ class Flag(enum.IntFlag):
     NOT_CONVERGED = 4
     """The search for the closest points of two shapes ended at its limit; the best bound that it found was used."""
 
+    INVALID_TIME_STEP = 16
+    """A step was asked for with a negative or not finite `Model.dt`, or an elapsed time; nothing was done."""
+
+
+@pytree
+class Sleep:
+    """What sleeping needs to remember; exists in scenes built with `Options.sleep`.
+
+    Attributes:
+      time: (body,) how long each body has been at rest [s].
+      asleep: (body,) whether it sleeps.
+      pose: (body, 7) position and orientation at the end of the last step, by which a change by the user is noticed.
+    """
+
+    time: Array
+    asleep: Array
+    pose: Array
+
 
 @pytree
 class State:
@@ -45,6 +63,7 @@ class State:
       flags: () bits of `Flag`; 0 when all is well.
       contact_pair: (place,) pair that held each place of the compact groups in the last step, ``first * shapes + second``
         in the numbering of the broadphase, -1 for none; None in scenes without broadphase.
+      sleep: timers of the sleeping system; None unless `Options.sleep`.
     """
 
     position: Array
@@ -58,6 +77,7 @@ class State:
     joint_force: Array
     flags: Array
     contact_pair: Array | None = None
+    sleep: Sleep | None = None
 
 
 def apply_force(state: State, body: int, force: Array, point: Array | None = None) -> State:

@@ -17,6 +17,7 @@ from mathota_jax.bodies import (
     Inertia,
     moving,
     moving_inertia,
+    of_all_bodies,
     pack_blocks,
     unpack,
     vector,
@@ -25,6 +26,7 @@ from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_co
 from mathota_jax.constraints import (
     compact,
     contact,
+    graph,
     joint,
     joint_layout,
     joint_rows,
@@ -34,6 +36,7 @@ from mathota_jax.constraints import (
 )
 from mathota_jax.constraints.assembly import Side, collect
 from mathota_jax.constraints.lever import levers
+from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
@@ -59,7 +62,10 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
       action: (motor,) one entry for each motor, clipped to its limit; None for no effort.
 
     Returns:
-      State at the end of the step; applied forces are cleared.
+      State at the end of the step; applied forces are cleared. With a `model.dt` of 0 no time passes and the state comes
+      back as it was, applied forces included; with one that is negative or not finite likewise, and
+      `Flag.INVALID_TIME_STEP` is set. Bodies that sleep (`Options.sleep`) keep their pose, of which the derivative is the
+      identity; that of their velocities is 0.
 
     Raises:
       ValueError: the action has the wrong shape, or a state of another scene was given.
@@ -76,6 +82,11 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
         raise ValueError(
             f"step: state.position must have shape ({scene.body_count}, 3) for this model, got {state.position.shape}; "
             "use jax.vmap for several worlds"
+        )
+    if (state.sleep is not None) != scene.options.sleep:
+        raise ValueError(
+            f"step: the model was built with Options(sleep={scene.options.sleep}), the state was not; take both from one "
+            "call of build"
         )
     return _batched_step(model, state, action)
 
@@ -127,6 +138,35 @@ class _Problem(NamedTuple):
 
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
     """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this."""
+    runs = (model.dt > 0) & (model.dt < jnp.inf)
+    # The program must stay finite for the derivative of the selection to be 0.
+    new = _simulate_or_rest(dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0)), state, action)
+    new = jax.tree.map(lambda before, after: jnp.where(runs, after, before), state, new)
+    bad = jnp.where(runs | (model.dt == 0), 0, int(Flag.INVALID_TIME_STEP))
+    return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype))
+
+
+def _simulate_or_rest(model: Model, state: State, action: Array) -> State:
+    """`_simulate`, but for batches in which everything sleeps."""
+    if not (model.scene.options.sleep and model.scene.dynamic_bodies):
+        return _simulate(model, state, action)
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))
+
+    def every_world(state: State) -> State:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), state)
+
+    return jax.lax.cond(
+        sleep.all_rest(model.scene, state, action),
+        lambda model, state, action: every_world(sleep.at_rest(state)),
+        lambda model, state, action: every_world(_simulate(model, state, action)),
+        model,
+        state,
+        action,
+    )
+
+
+def _simulate(model: Model, state: State, action: Array) -> State:
+    """The phases of a step."""
     scene = model.scene
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
@@ -143,7 +183,10 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
-    return _finish(scene, state, moved, _forces(model, problem, impulses))
+    if scene.options.continuous and scene.pair_groups:
+        moved = _stop_at_impacts(model, bodies, moved, displacement)
+    new = _finish(scene, state, moved, _forces(model, problem, impulses))
+    return _let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
 
 _batched_step = batch_last(step_worlds_last)
@@ -215,6 +258,8 @@ def _constrain(
                 state.position,
             )
         )
+        if scene.options.continuous:
+            contacts = contact.near_contacts(scene, model, contacts)
         motion = contact.Motion(
             blocks.position, Side(blocks.velocity, blocks.angular_velocity), Side(*free), inertia, _gravity(model)
         )
@@ -292,9 +337,23 @@ def _correct_positions(
     return displace(moved, inertia, correction)
 
 
+def _stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:
+    """Fast bodies stop at the first touch on their way (guide 10.4)."""
+    scene = model.scene
+    motion = events.Motion(bodies.position, bodies.orientation, *(of_all_bodies(scene, part) for part in displacement))
+    return moving(scene, events.stop_at_impacts(model, motion, _merge(scene, bodies, moved)))
+
+
 def _merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:
     """All bodies, the moving ones at their new place."""
     return jax.tree.map(lambda old, new: _place(scene, old[:, None], [new])[:, 0], bodies, moved)
+
+
+def _let_sleep(model: Model, old: State, new: State, action: Array, problem: _Problem) -> State:
+    """Phase 8: islands fall asleep and wake (guide 3.4 and 12.2)."""
+    edges = graph.body_graph(model, old, new, problem.contacts, problem.close)
+    new, sleepers = sleep.let_sleep(model, old, new, action, edges)
+    return dataclasses.replace(new, **graph.keep_forces(model, old, new, problem.close, sleepers))
 
 
 def _place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:

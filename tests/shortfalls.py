@@ -9,6 +9,9 @@ EVENTS = "contacts are taken at the start of the step, not at the time of impact
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
+    "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
+    "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
+    "its centre ends up to 77 mm in the ground",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/physics/test_billiards.py::test_oblique_collision": EVENTS + "positions 6.6e-3 m off at dt 1/240, gate 1e-3",
@@ -33,8 +36,8 @@ SHORTFALLS: dict[str, str] = {
     + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
     "tests/unit/test_state.py::test_nothing_assumes_an_up_axis": "the order of the sweeps follows the axes of the tangents: "
     "3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6",
-    "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, then "
-    "stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
+    "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, "
+    "then stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
     "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter": SWEEPS
     + "positions differ by 0.03 to 0.7 m after a pile has settled, gate 1e-4",
 }
