@@ -8,6 +8,8 @@ from typing import Any
 
 BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
 
+SOLVER_CHOICES = ("pgs", "converged")
+
 OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1))
 """Integers that may be None, and their least value."""
 
@@ -34,6 +36,9 @@ class Options:
         "sort_and_sweep", "grid", "bvh". Guide 5.4.
       pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
+      solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
+        to round-off, with derivatives of the solution, whatever the mass ratio; see `solver.converged`. The numbers of
+        iterations above mean nothing to it, except that `position_iterations=0` leaves positions alone.
     """
 
     dt: float = 1 / 60
@@ -48,6 +53,7 @@ class Options:
     broadphase: str = "auto"
     pair_capacity: int | None = None
     gradient_iterations: int | None = None
+    solver: str = "pgs"
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and self.dt > 0):
@@ -67,6 +73,9 @@ class Options:
                 raise ValueError(f"Options.{name} must lie between 0 and 1, got {value!r}")
         if not isinstance(self.warm_start, bool):
             raise ValueError(f"Options.warm_start must be True or False, got {self.warm_start!r}")
+        if self.solver not in SOLVER_CHOICES:
+            known = ", ".join(repr(choice) for choice in SOLVER_CHOICES)
+            raise ValueError(f"Options.solver must be one of {known}, got {self.solver!r}")
         if self.broadphase not in BROADPHASE_CHOICES:
             known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
             raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")

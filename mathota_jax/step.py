@@ -28,7 +28,7 @@ from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
+from mathota_jax.solver import converged, pgs
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once, materialize
@@ -127,12 +127,12 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = _constrain(model, state, bodies, blocks, inertia, free)
     start = _warm_start(model, state, problem)
-    solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
+    solved, impulses, failed = _solve(scene, problem, _pack(scene, *free), start)
     lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
-    return _finish(scene, state, moved, _forces(model, problem, impulses))
+    return _finish(scene, state, moved, _forces(model, problem, impulses), failed)
 
 
 _batched_step = batch_last(step_worlds_last)
@@ -232,13 +232,15 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
 
 def _solve(
     scene: Scene, problem: _Problem, velocity: Array, start: tuple[Array, ...]
-) -> tuple[Array, tuple[Array, ...]]:
-    """Phase 5: velocity constraints."""
+) -> tuple[Array, tuple[Array, ...], Array | None]:
+    """Phase 5: velocity constraints. Also 1 for each world (world,) that was not solved, None if no one asked."""
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
+    if scene.options.solver == "converged":
+        return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
-    return pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start)
+    return *pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start), None
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
@@ -249,7 +251,10 @@ def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: 
     """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
     count = len(problem.joint_rows)
     halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
+    levers = [
+        impulse * contact.lever(group, impulse, dt)
+        for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)
+    ]
     return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
 
 
@@ -275,6 +280,8 @@ def _correct_positions(
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
+    if options.solver == "converged":
+        return displace(moved, converged.solve(tuple(rows), zero, start)[0])
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
     return displace(moved, correction)
@@ -332,8 +339,8 @@ def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> 
     return flags
 
 
-def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array]) -> State:
-    """The new state with its flags."""
+def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array], failed: Array | None = None) -> State:
+    """The new state with its flags; `failed` is 1 in the worlds whose constraints were not solved."""
     moved = compute_once(moved, moved.position.x)
     position, orientation, velocity, angular_velocity = (
         _place(scene, getattr(state, name), getattr(moved, name))
@@ -341,6 +348,8 @@ def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array])
     )
     finite = [jnp.isfinite(value).all((0, 1)) for value in (position, orientation, velocity, angular_velocity)]
     broken = jnp.where(finite[0] & finite[1] & finite[2] & finite[3], 0, int(Flag.NON_FINITE))
+    if failed is not None:
+        broken = broken | jnp.where(failed > 0, int(Flag.SOLVER_NOT_CONVERGED), 0)
     changes: dict[str, Any] = {
         "position": position,
         "orientation": orientation,

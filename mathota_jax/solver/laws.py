@@ -63,7 +63,7 @@ class Cone:
         free_2 = old_2 - error_2 * self.tangent_mass
         squared = free_1 * free_1 + free_2 * free_2
         limit = self.friction * normal
-        sliding = squared > limit * limit
+        sliding = squared >= limit * limit  # where nothing presses, nothing sticks either
         scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
         return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=row)
 
