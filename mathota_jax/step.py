@@ -128,7 +128,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     problem = _constrain(model, state, bodies, blocks, inertia, free)
     start = _warm_start(model, state, problem)
     solved, impulses, failed = _solve(scene, problem, _pack(scene, *free), start)
-    lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
+    lever_sum = _lever_sum(model, problem, impulses, solved, free)
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
@@ -247,15 +247,22 @@ def _gradient_iterations(scene: Scene, iterations: int) -> int:
     return scene.options.gradient_iterations or 2 * iterations
 
 
-def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
+def _lever_sum(
+    model: Model, problem: _Problem, impulses: tuple[Array, ...], solved: Array, free: tuple[Vec3, Vec3]
+) -> Array:
     """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
-    count = len(problem.joint_rows)
+    dt, count = model.dt, len(problem.joint_rows)
+    if model.scene.options.solver == "converged":
+        # From the change of velocity, which is solved for: a sum of large impulses would be lost in their round-off.
+        halves = [jnp.zeros_like(impulse) for impulse in impulses[:count]]
+        early = [
+            impulse * (contact.lever(group, impulse, dt) - 0.5 * dt)
+            for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)
+        ]
+        return pgs.add_impulses(problem.rows, 0.5 * dt * (solved - _pack(model.scene, *free)), (*halves, *early))
     halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [
-        impulse * contact.lever(group, impulse, dt)
-        for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)
-    ]
-    return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
+    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
+    return pgs.add_impulses(problem.rows, jnp.zeros_like(solved), (*halves, *levers))
 
 
 def _correct_positions(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,9 @@ INEXACT = 0.3
 SLOW = 0.5
 """Share of the residual left by an outer step at which the stiffness grows."""
 
+PATIENCE = 4
+"""Slow outer steps in a row after which a residual that is acceptable is accepted: the stiffness grew at each."""
+
 FIRST_STIFFNESS, STIFFNESS_FACTOR = 10.0, 10.0
 LARGEST_STIFFNESS = {"float32": 1e5, "float64": 1e9}
 """The linear system loses the mass of a body beside a stiffness near the inverse of round-off."""
@@ -68,11 +71,13 @@ class _Search(NamedTuple):
       velocity: current, equal to that of the impulses `trial`.
       trial: impulses of the inner iteration.
       centre: impulses that the proximal term pulls to.
-      best: impulses with the least residual so far.
+      best: impulses with the least residual so far, and the velocity that was found with them: by increments, since the
+        round-off of large impulses, ``u_free + M^-1 J^T impulses``, would shake a light body under a heavy one.
       least: that residual.
       residual: after the last outer step.
       stiffness: of the laws.
       newton: Newton steps since the last outer step.
+      slow: outer steps in a row that hardly reduced the residual.
       done: whether the world is finished.
       count: () iterations.
     """
@@ -80,11 +85,12 @@ class _Search(NamedTuple):
     velocity: Array
     trial: Impulses
     centre: Impulses
-    best: Impulses
+    best: tuple[Array, Impulses]
     least: Array
     residual: Array
     stiffness: Array
     newton: Array
+    slow: Array
     done: Array
     count: Array
 
@@ -125,17 +131,18 @@ def solve(rows: tuple[Rows, ...], velocity: Array, impulses: Impulses) -> tuple[
         start,
         impulses,
         impulses,
-        impulses,
+        (start, impulses),
         residual,
         residual,
         jnp.full(worlds, FIRST_STIFFNESS, velocity.dtype),
+        jnp.zeros(worlds, jnp.int32),
         jnp.zeros(worlds, jnp.int32),
         residual <= problem.tolerance,
         jnp.zeros((), jnp.int32),
     )
     search = lax.while_loop(lambda s: (s.count < LIMIT) & ~s.done.all(), problem.iterate, search)
     failed = jnp.where(search.least <= problem.acceptable, 0.0, 1.0).astype(velocity.dtype)
-    return add_impulses(rows, velocity, search.best), search.best, failed
+    return *search.best, failed
 
 
 class _Problem:
@@ -190,17 +197,19 @@ class _Problem:
         harder = outer & ~gives_up & (slow | (search.newton == 0))
         stiffness = jnp.where(harder, search.stiffness * STIFFNESS_FACTOR, search.stiffness)
         stiffness = jnp.where(gives_up, search.stiffness / STIFFNESS_FACTOR, stiffness)
+        slow_steps = jnp.where(outer, jnp.where(slow, search.slow + 1, 0), search.slow)
         better = residual < search.least
         new = _Search(
             velocity=found.velocity,
             trial=found.trial,
             centre=_where(outer, found.impulses, search.centre),
-            best=_where(better, found.impulses, search.best),
+            best=_where(better, (found.velocity, found.impulses), search.best),
             least=jnp.where(better, residual, search.least),
             residual=jnp.where(outer, residual, search.residual),
             stiffness=jnp.clip(stiffness, 1.0, LARGEST_STIFFNESS[str(self.free.dtype)]),
             newton=jnp.where(outer, 0, search.newton + 1),
-            done=(residual <= self.tolerance) | (slow & (residual <= self.acceptable)),
+            slow=slow_steps,
+            done=(residual <= self.tolerance) | ((slow_steps >= PATIENCE) & (search.least <= self.acceptable)),
             count=search.count + 1,
         )
         kept = jax.tree.map(
@@ -255,7 +264,7 @@ class _Problem:
         return lax.while_loop(unfinished, body, (jnp.ones((), jnp.int32), first.step, first))[2]
 
 
-def _where(condition: Array, new: _Trial | Impulses, old: _Trial | Impulses):
+def _where(condition: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
