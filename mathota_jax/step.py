@@ -24,6 +24,7 @@ from mathota_jax.bodies import (
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
 from mathota_jax.constraints import compact, contact, joint, warm_start
 from mathota_jax.constraints.assembly import Side, collect
+from mathota_jax.constraints.lever import levers
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
@@ -126,10 +127,11 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     force, torque = _external(model, state, bodies, action)
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = _constrain(model, state, bodies, blocks, inertia, free)
-    start = _warm_start(model, state, problem)
-    solved, impulses, failed = _solve(scene, problem, _pack(scene, *free), start)
-    lever_sum = _lever_sum(model, problem, impulses, solved, free)
-    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
+    packed = _pack(scene, *free)
+    start = _warm_start(model, state, problem, inertia, packed)
+    solved, impulses, failed = _solve(scene, problem, packed, start)
+    lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
+    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
     return _finish(scene, state, moved, _forces(model, problem, impulses), failed)
@@ -210,7 +212,7 @@ def _constrain(
     return _Problem(joints, joint_rows, contacts, contact_rows, close)
 
 
-def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, ...]:
+def _warm_start(model: Model, state: State, problem: _Problem, inertia: Inertia, velocity: Array) -> tuple[Array, ...]:
     """Impulses to start from: those of the last step where rows and features are the same (guide 12.4)."""
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
@@ -227,13 +229,15 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
             )
         force = compute_once(warm_start.join_forces(parts), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
+        if len(model.scene.dynamic_bodies) > 1:
+            return warm_start.plausible(problem.rows, inertia, velocity, tuple(start))
     return tuple(start)
 
 
 def _solve(
     scene: Scene, problem: _Problem, velocity: Array, start: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
-    """Phase 5: velocity constraints. Also 1 for each world (world,) that was not solved, None if no one asked."""
+    """Phase 5: velocity constraints. Also 1 for each world (world,) that was not solved; None from "pgs"."""
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
@@ -245,24 +249,6 @@ def _solve(
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
     return scene.options.gradient_iterations or 2 * iterations
-
-
-def _lever_sum(
-    model: Model, problem: _Problem, impulses: tuple[Array, ...], solved: Array, free: tuple[Vec3, Vec3]
-) -> Array:
-    """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
-    dt, count = model.dt, len(problem.joint_rows)
-    if model.scene.options.solver == "converged":
-        # From the change of velocity, which is solved for: a sum of large impulses would be lost in their round-off.
-        halves = [jnp.zeros_like(impulse) for impulse in impulses[:count]]
-        early = [
-            impulse * (contact.lever(group, impulse, dt) - 0.5 * dt)
-            for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)
-        ]
-        return pgs.add_impulses(problem.rows, 0.5 * dt * (solved - _pack(model.scene, *free)), (*halves, *early))
-    halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
-    return pgs.add_impulses(problem.rows, jnp.zeros_like(solved), (*halves, *levers))
 
 
 def _correct_positions(
@@ -291,7 +277,7 @@ def _correct_positions(
         return displace(moved, converged.solve(tuple(rows), zero, start)[0])
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
-    return displace(moved, correction)
+    return displace(moved, inertia, correction)
 
 
 def _merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:

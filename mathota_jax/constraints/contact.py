@@ -1,7 +1,7 @@
 """Contact rows: non-penetration, restitution at the time of impact, isotropic friction (guide 8 and 9).
 
 A row acts on the velocities at the *end* of the step, while the position moves by
-``dt (v_start + v_free) / 2 + lever * M^-1 J^T impulse``: the impulse of a contact that lasts the whole step acts, on
+``dt (v_start + v_free) / 2 + lever (v_end - v_free)``: the impulse of a contact that lasts the whole step acts, on
 average, at half time (lever dt/2), that of an impact at its time of impact (lever dt - tau). So a sliding block keeps its
 exact parabola and a bounce at tau is followed by the rest of the step in flight, whose derivative is the saltation matrix.
 """
@@ -43,9 +43,6 @@ from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
 RELAXATION = 4 / 3
 """Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
 
-ALONE_MARGIN = 2.5
-"""Over the impulse of a plastic impact; an elastic one needs twice as much."""
-
 
 class Motion(NamedTuple):
     """Moving bodies at the start of a step: positions, and velocities now and at its end if nothing constrained them."""
@@ -62,12 +59,10 @@ class ContactRows(NamedTuple):
 
     Attributes:
       rows: for the velocity solver.
-      lever: (turn, row, column, world) time [s] that an impulse has to act on the position.
+      lever: (turn, 1, column, world) time [s] that the contact's impulse has to act on the position.
       directions: row directions in the world frame, components (turn * column, world).
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.
-      alone: (turn, 1, column, world) largest normal impulse of the manifold if its two bodies hit each other and carry
-        nothing else; None for solvers whose residual hides what is said in `lever`.
     """
 
     rows: Rows
@@ -75,7 +70,6 @@ class ContactRows(NamedTuple):
     directions: tuple[Vec3, ...]
     separation: Array
     slop: Array
-    alone: Array | None = None
 
 
 class PlacedPairs(NamedTuple):
@@ -145,12 +139,6 @@ def contact_rows(
 
     target, lever = _impact(scene, table, model, chosen, motion, start, free, pairs)
     active = chosen.active.astype(normal.x.dtype)
-    alone = None
-    if scene.options.solver == "converged":
-        inverse_mass = [
-            select_blocks(table, side, motion.inertia.inverse_mass, places) for side in range(len(jacobians))
-        ]
-        alone = _impulse_alone(start, norm(motion.gravity) * model.dt, functools.reduce(jnp.add, inverse_mass))
     normal_mass = active / _row_bound(table, jacobians, responses, active, (0,))
     bias = [-target]
     if scene.friction:
@@ -180,7 +168,6 @@ def contact_rows(
         directions,
         pack_scalars(table, [separation], worlds),
         pack_scalars(table, [slop], worlds),
-        None if alone is None else pack_scalars(table, [alone], worlds),
     )
 
 
@@ -374,31 +361,6 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
         table=rows.table,
         places=rows.places,
     )
-
-
-def _impulse_alone(start: Array, fall: Array, inverse_mass: Array) -> Array:
-    """Largest normal impulse of a manifold whose bodies hit each other at the velocity `start` and carry nothing else.
-
-    0 for contacts that rest, whose velocities are round-off beside `fall`, that of a free fall for one step.
-    """
-    speed = jnp.maximum(-start, 0.0)
-    return jnp.where(speed > 0.5 * fall, ALONE_MARGIN * (speed + fall) / inverse_mass, 0.0)
-
-
-def lever(contact: ContactRows, impulse: Array, dt: Array) -> Array:
-    """Time [s] that the impulses of a table have to act on the positions.
-
-    `ContactRows.lever` holds for a contact by itself. In a stack the impulse is that of the whole load; if it acted from
-    the time of impact on, the lowest contact of n boxes would be moved n times as far as it should be. With impulses
-    that are solved exactly, round-off then grows n-fold in every other step, until the stack jumps apart.
-    """
-    if contact.alone is None:
-        return contact.lever
-    turns, _, columns, worlds = impulse.shape
-    together = contact.rows.table.together
-    total = impulse[:, :1].reshape(turns, 1, columns // together, together, worlds).sum(3)
-    loaded = settle(jnp.where(jnp.repeat(total, together, axis=2) > contact.alone, 1.0, 0.0)) > 0
-    return jnp.where(loaded, 0.5 * dt, contact.lever)
 
 
 def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:

@@ -30,7 +30,7 @@ from mathota_jax.solver.pgs import Rows, add_impulses, linearise, row_velocity
 from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.spatial.safe import safe_divide
 
-LIMIT = 60
+LIMIT = 150
 """Largest number of linear systems in a solve. Measured: ten boxes at rest take 1 or 2, a falling pile 20."""
 
 NEWTON_LIMIT = 8
