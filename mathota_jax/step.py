@@ -274,7 +274,7 @@ def _correct_positions(
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
     if options.solver == "converged":
-        return displace(moved, converged.solve(tuple(rows), zero, start)[0])
+        return displace(moved, inertia, converged.solve(tuple(rows), zero, start)[0])
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
     return displace(moved, inertia, correction)
