@@ -38,8 +38,11 @@ class Options:
       pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
       solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
-        to round-off, with derivatives of the solution, whatever the mass ratio; see `solver.converged`. The numbers of
-        iterations above mean nothing to it, except that `position_iterations=0` leaves positions alone.
+        together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
+        solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm
+        started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32 and 3e-6 m of
+        movement, but 26 CPU-s to compile. Of the numbers of iterations above only `position_iterations=0`, which leaves
+        positions alone, means anything to it.
     """
 
     dt: float = 1 / 60
