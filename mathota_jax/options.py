@@ -40,7 +40,7 @@ class Options:
       solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
         together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
         solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm
-        started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32 and 3e-6 m of
+        started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32 and 6e-6 m of
         movement, but 26 CPU-s to compile. Of the numbers of iterations above only `position_iterations=0`, which leaves
         positions alone, means anything to it.
     """
