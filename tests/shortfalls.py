@@ -26,12 +26,12 @@ SHORTFALLS: dict[str, str] = {
     + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
     "tests/unit/test_state.py::test_nothing_assumes_an_up_axis": "the order of the sweeps follows the axes of the tangents: "
     "3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6",
-    "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, then "
-    "stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
+    "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, "
+    "then stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
     "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter": SWEEPS
     + "positions differ by 0.03 to 0.7 m after a pile has settled, gate 1e-4",
     **{
-        f"tests/unit/test_converged.py::test_contact_laws_hold[{case}-10000.0]": "mass ratio 1e4 among bodies that are hit at "
+        f"tests/unit/test_converged.py::test_contact_laws_hold[{case}-10000.0]": "mass ratio 1e4 among bodies hit at "
         "random points, from nothing: the converged solver reaches its limit of 150 iterations or misses the gate"
         for case in ("float32-1", "float32-2", "float32-3", "float32-4", "float32-5", "float64-3")
     },

@@ -48,5 +48,5 @@ def test_bad_broadphase_is_refused(name, value):
 
 
 def test_an_unknown_solver_is_refused():
-    with pytest.raises(ValueError, match="Options.solver must be one of 'pgs', 'converged', got 'newton'"):
+    with pytest.raises(ValueError, match=r"Options\.solver must be one of 'pgs', 'converged', got 'newton'"):
         Options(solver="newton")
