@@ -1,7 +1,7 @@
 """The linear system behind the derivative of solved impulses, solved densely.
 
-``x = K x + H J (d + M^-1 J^T x) + r`` with K and H the Jacobians of the laws. Redundant rows make it singular, though
-consistent: many impulses, one velocity. Proximal steps ``(1 - K + delta - H J M^-1 J^T) x' = delta x + H J d + r`` from 0
+``x = K x + H J M^-1 J^T x + r`` with K and H the Jacobians of the laws. Redundant rows make it singular, though
+consistent: many impulses, one velocity. Proximal steps ``(1 - K + delta - H J M^-1 J^T) x' = delta x + r`` from 0
 share one factorization and converge to a solution whose velocity is the right one.
 """
 
@@ -47,7 +47,7 @@ def solve(
             side + delta * _apply(inverse, part)
             for side, inverse, part in zip(settled, inverses, carry[1], strict=True)
         )
-        new = velocity_system.solve(factor, add_impulses(rows, velocity, fixed))
+        new = velocity_system.solve(factor, add_impulses(rows, jnp.zeros_like(velocity), fixed))
         impulses = tuple(
             part + _apply(matrix, row_velocity(group, new))
             for part, matrix, group in zip(fixed, slopes, rows, strict=True)
