@@ -2,6 +2,9 @@
 
 from mathota_jax.builder import SceneBuilder
 from mathota_jax.collision.raycast import Raycast, raycast
+from mathota_jax.constraints.joints.ball_and_socket import BallAndSocket
+from mathota_jax.constraints.joints.distance import Distance
+from mathota_jax.constraints.joints.fixed import Fixed
 from mathota_jax.constraints.joints.hinge import Hinge
 from mathota_jax.constraints.joints.slider import Slider
 from mathota_jax.diagnostics import (
@@ -10,6 +13,7 @@ from mathota_jax.diagnostics import (
     contact_forces,
     contacts,
     energy,
+    joint_forces,
     joint_position,
     joint_velocity,
     momentum,
@@ -18,8 +22,8 @@ from mathota_jax.geometry import Box, Capsule, Compound, Cone, Cylinder, Heightf
 from mathota_jax.model import Model
 from mathota_jax.options import Options
 from mathota_jax.queries import (
+    ClosestPoints,
     ContactManifold,
-    Distance,
     Geometry,
     Impact,
     closest_points,
@@ -34,14 +38,17 @@ from mathota_jax.step import rollout, step
 __version__ = "0.1.0"
 
 __all__ = [
+    "BallAndSocket",
     "Box",
     "Capsule",
+    "ClosestPoints",
     "Compound",
     "Cone",
     "ContactManifold",
     "Contacts",
     "Cylinder",
     "Distance",
+    "Fixed",
     "Flag",
     "Geometry",
     "Heightfield",
@@ -63,6 +70,7 @@ __all__ = [
     "contact_forces",
     "contacts",
     "energy",
+    "joint_forces",
     "joint_position",
     "joint_velocity",
     "manifold",

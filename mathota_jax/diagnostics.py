@@ -9,7 +9,8 @@ from mathota_jax.batching import batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack, vector
 from mathota_jax.collision.narrowphase import find_contacts, join_contacts
 from mathota_jax.constraints import compact
-from mathota_jax.constraints.joint import joint_coordinates
+from mathota_jax.constraints.joint_layout import joint_row_count
+from mathota_jax.constraints.joint_rows import joint_coordinates, moved_by, reactions
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.vector import Vec3, cross, dot
@@ -121,12 +122,16 @@ def _angular_momentum(model: Model, state: State) -> Array:
 
 
 def joint_position(model: Model, state: State) -> Array:
-    """Free coordinate of each joint, (joint,): angle [rad] or displacement [m] of the child from the built pose."""
+    """Coordinate of each joint, (joint,). Differentiable.
+
+    Angle [rad] of a hinge and displacement [m] of a slider from the built pose, twist [rad] of a ball and socket, length
+    [m] of a distance joint; 0 for a fixed joint.
+    """
     return _joint_coordinates(model, state)[0]
 
 
 def joint_velocity(model: Model, state: State) -> Array:
-    """Rate of the free coordinate of each joint, (joint,) [rad/s] or [m/s]."""
+    """Rate of the coordinate of each joint, (joint,) [rad/s] or [m/s]. Differentiable."""
     return _joint_coordinates(model, state)[1]
 
 
@@ -135,6 +140,38 @@ def _joint_coordinates(model: Model, state: State) -> tuple[Array, Array]:
     if not model.scene.joints:
         return state.joint_force, state.joint_force
     return joint_coordinates(model, unpack(state))
+
+
+def joint_forces(model: Model, state: State) -> tuple[Array, Array]:
+    """Mean force and torque over the last step that each joint exerted on its child at the child's anchor.
+
+    All that acts in the joint counts: what holds it, its stops, spring, damper, friction and its velocity and position
+    motors. A torque motor does not: its torque is the action, an outer load like gravity. Accurate to second order at the
+    middle of the step, half a step before `state`. The parent feels the opposite force at the same place. A distance joint
+    exerts its force along the line: tension on the child points towards the parent's anchor. Differentiable.
+
+    Returns:
+      Force (joint, 3) [N] and torque (joint, 3) [N m], world frame; 0 before the first step.
+
+    Raises:
+      ValueError: the state belongs to another scene.
+    """
+    row_count = joint_row_count(model.scene)
+    if state.joint_force.shape[-1:] != (row_count,):
+        raise ValueError(
+            f"joint_forces: the state has {state.joint_force.shape[-1]} joint rows, the model {row_count}: they belong to "
+            "different scenes"
+        )
+    return _joint_forces(model, state)
+
+
+@batch_last
+def _joint_forces(model: Model, state: State) -> tuple[Array, Array]:
+    if not model.scene.joints:
+        return state.position[:0], state.position[:0]
+    middle = moved_by(unpack(state), -0.5 * model.dt)
+    force, torque = (jnp.stack(list(v), axis=1) for v in reactions(model, middle, state.joint_force))
+    return force, torque
 
 
 def _check(model: Model, state: State) -> None:

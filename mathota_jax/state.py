@@ -42,7 +42,9 @@ class State:
       applied_torque: (body, 3) torque about the centre of mass accumulated for the next step [N m], world frame.
       contact_force: (slot, 3) mean force of the last step on body B of each contact slot [N], world frame.
       contact_feature: (slot,) feature that held each slot in the last step, -1 for none.
-      joint_force: (joint row,) mean generalized force of each joint row in the last step [N] or [N m].
+      joint_force: (joint row,) mean generalized force of each joint row in the last step [N] or [N m]. Joints of one kind
+        with the same features form a group; rows are numbered group (by its first joint), row (those of the kind, then
+        those of the features in order), joint. `joint_forces` gives them as vectors.
       flags: () bits of `Flag`; 0 when all is well.
       contact_pair: (place,) pair that held each place of the compact groups in the last step, ``first * shapes + second``
         in the numbering of the broadphase, -1 for none; None in scenes without broadphase.

@@ -22,7 +22,16 @@ from mathota_jax.bodies import (
     vector,
 )
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
-from mathota_jax.constraints import compact, contact, joint, warm_start
+from mathota_jax.constraints import (
+    compact,
+    contact,
+    joint,
+    joint_layout,
+    joint_rows,
+    motor,
+    row_coefficients,
+    warm_start,
+)
 from mathota_jax.constraints.assembly import Side, collect
 from mathota_jax.constraints.lever import levers
 from mathota_jax.dynamics.free_motion import free_velocity
@@ -105,7 +114,7 @@ def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, St
 class _Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word."""
 
-    joints: joint.JointRows | None
+    joints: joint_rows.JointRows | None
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
@@ -126,7 +135,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     force, torque = _external(model, state, bodies, action)
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
-    problem = _constrain(model, state, bodies, blocks, inertia, free)
+    problem = _constrain(model, state, bodies, blocks, inertia, free, action)
     packed = _pack(scene, *free)
     start = _warm_start(model, state, problem, inertia, packed)
     solved, impulses, failed = _solve(scene, problem, packed, start)
@@ -143,8 +152,8 @@ _batched_step = batch_last(step_worlds_last)
 def _external(model: Model, state: State, bodies: Bodies, action: Array) -> tuple[Vec3, Vec3]:
     """Phase 1: forces and torques on the moving bodies, gravity excepted."""
     force, torque = vector(state.applied_force), vector(state.applied_torque)
-    if model.scene.motors:
-        motor_force, motor_torque = joint.motor_forces(model, bodies, action)
+    if motor.exert_torque(model.scene):
+        motor_force, motor_torque = motor.motor_forces(model, bodies, action)
         force, torque = force + motor_force, torque + motor_torque
     return take((force, torque), model.scene.dynamic_bodies)
 
@@ -172,16 +181,24 @@ def _pack(scene: Scene, linear: Vec3, angular: Vec3) -> Array:
 
 
 def _constrain(
-    model: Model, state: State, bodies: Bodies, blocks: Bodies, inertia: Inertia, free: tuple[Vec3, Vec3]
+    model: Model,
+    state: State,
+    bodies: Bodies,
+    blocks: Bodies,
+    inertia: Inertia,
+    free: tuple[Vec3, Vec3],
+    action: Array,
 ) -> _Problem:
     """Phases 2, 3 and 5: narrow phase and rows."""
     scene = model.scene
-    joints, joint_rows = None, ()
-    if scene.joints:
-        joints = joint.joint_rows(model, bodies)
-        middle = joint.joint_rows(model, joint.midpoint(bodies, model.dt))
-        joint_rows = tuple(
-            joint.velocity_rows(scene, table, model, joints, middle, inertia) for table in joint.joint_tables(scene)
+    joints, tables = None, ()
+    if joint_layout.joint_row_count(scene):
+        joints = joint_rows.joint_rows(model, bodies)
+        middle = joint_rows.joint_rows(model, joint_rows.moved_by(bodies, 0.5 * model.dt))
+        coefficients = row_coefficients.row_coefficients(model, action)
+        joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
+        tables = tuple(
+            joint.velocity_rows(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene)
         )
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
@@ -209,7 +226,7 @@ def _constrain(
             for group in (close.groups if close else ())
             for table, pairs in group.tables
         ]
-    return _Problem(joints, joint_rows, contacts, contact_rows, close)
+    return _Problem(joints, tables, contacts, contact_rows, close)
 
 
 def _warm_start(model: Model, state: State, problem: _Problem, inertia: Inertia, velocity: Array) -> tuple[Array, ...]:
@@ -262,10 +279,9 @@ def _correct_positions(
     packed = _pack(scene, *displacement)
     rows: list[Rows] = []
     if problem.joints is not None:
-        error = joint.joint_rows(model, _merge(scene, bodies, moved)).error
+        error = joint_rows.joint_rows(model, _merge(scene, bodies, moved)).error
         rows += [
-            joint.position_rows(scene, group.table, problem.joints, error, inertia, options.position_percent)
-            for group in problem.joint_rows
+            joint.position_rows(scene, group.table, problem.joints, error, inertia) for group in problem.joint_rows
         ]
     for group in problem.contact_rows:
         change = pgs.row_velocity(group.rows, packed)[:, :1]
@@ -309,7 +325,7 @@ def _forces(model: Model, problem: _Problem, impulses: tuple[Array, ...]) -> dic
     if problem.joints is not None:
         tables = [rows.table for rows in problem.joint_rows]
         values = [impulse[:, 0] / model.dt for impulse in impulses[:count]]
-        changes["joint_force"] = collect(tables, values, joint.joint_row_count(scene))
+        changes["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
     if problem.contacts is not None:
         impulses = impulses[count:]
         changes["contact_force"] = contact.slot_force(problem.contact_rows, list(impulses), scene.slot_count, model.dt)
