@@ -8,6 +8,8 @@ from typing import Any
 
 BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
 
+SOLVER_CHOICES = ("pgs", "converged")
+
 OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1))
 """Integers that may be None, and their least value."""
 
@@ -35,6 +37,12 @@ class Options:
         "sort_and_sweep", "grid", "bvh". Guide 5.4.
       pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
+      solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
+        together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
+        solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm
+        started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32 and 6e-6 m of
+        movement, but 26 CPU-s to compile. Of the numbers of iterations above only `position_iterations=0`, which leaves
+        positions alone, means anything to it.
       continuous: check the motion of fast bodies for what they meet on their way and stop them at the first touch, to be
         handled in the next step. Off: absent; contacts found at the start of a step are then extrapolated over it, which
         is exact for bodies that hit what they head for, but lets fast turning ones slip through and stops others at what
@@ -61,6 +69,7 @@ class Options:
     broadphase: str = "auto"
     pair_capacity: int | None = None
     gradient_iterations: int | None = None
+    solver: str = "pgs"
     continuous: bool = False
     sleep: bool = False
     sleep_velocity: float = 0.05
@@ -91,6 +100,9 @@ class Options:
             value = getattr(self, name)
             if not isinstance(value, bool):
                 raise ValueError(f"Options.{name} must be True or False, got {value!r}")
+        if self.solver not in SOLVER_CHOICES:
+            known = ", ".join(repr(choice) for choice in SOLVER_CHOICES)
+            raise ValueError(f"Options.solver must be one of {known}, got {self.solver!r}")
         if self.broadphase not in BROADPHASE_CHOICES:
             known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
             raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")

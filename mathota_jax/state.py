@@ -24,6 +24,9 @@ class Flag(enum.IntFlag):
     NOT_CONVERGED = 4
     """The search for the closest points of two shapes ended at its limit; the best bound that it found was used."""
 
+    SOLVER_NOT_CONVERGED = 8
+    """`Options.solver="converged"` ended at its limit of iterations; the best impulses that it found were used."""
+
     INVALID_TIME_STEP = 16
     """A step was asked for with a negative or not finite `Model.dt`, or an elapsed time; nothing was done."""
 

@@ -41,7 +41,7 @@ from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
+from mathota_jax.solver import converged, pgs
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once, materialize
@@ -178,14 +178,14 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     problem = _constrain(model, state, bodies, blocks, inertia, free, action)
     packed = _pack(scene, *free)
     start = _warm_start(model, state, problem, inertia, packed)
-    solved, impulses = _solve(scene, problem, packed, start)
+    solved, impulses, failed = _solve(scene, problem, packed, start)
     lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
     moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
         moved = _stop_at_impacts(model, bodies, moved, displacement)
-    new = _finish(scene, state, moved, _forces(model, problem, impulses))
+    new = _finish(scene, state, moved, _forces(model, problem, impulses), failed)
     return _let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
 
@@ -298,13 +298,15 @@ def _warm_start(model: Model, state: State, problem: _Problem, inertia: Inertia,
 
 def _solve(
     scene: Scene, problem: _Problem, velocity: Array, start: tuple[Array, ...]
-) -> tuple[Array, tuple[Array, ...]]:
-    """Phase 5: velocity constraints."""
+) -> tuple[Array, tuple[Array, ...], Array | None]:
+    """Phase 5: velocity constraints. Also 1 for each world (world,) that was not solved; None from "pgs"."""
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
+    if scene.options.solver == "converged":
+        return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
-    return pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start)
+    return *pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start), None
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
@@ -332,6 +334,8 @@ def _correct_positions(
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
+    if options.solver == "converged":
+        return displace(moved, inertia, converged.solve(tuple(rows), zero, start)[0])
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
     return displace(moved, inertia, correction)
@@ -403,8 +407,8 @@ def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> 
     return flags
 
 
-def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array]) -> State:
-    """The new state with its flags."""
+def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array], failed: Array | None = None) -> State:
+    """The new state with its flags; `failed` is 1 in the worlds whose constraints were not solved."""
     moved = compute_once(moved, moved.position.x)
     position, orientation, velocity, angular_velocity = (
         _place(scene, getattr(state, name), getattr(moved, name))
@@ -412,6 +416,8 @@ def _finish(scene: Scene, state: State, moved: Bodies, forces: dict[str, Array])
     )
     finite = [jnp.isfinite(value).all((0, 1)) for value in (position, orientation, velocity, angular_velocity)]
     broken = jnp.where(finite[0] & finite[1] & finite[2] & finite[3], 0, int(Flag.NON_FINITE))
+    if failed is not None:
+        broken = broken | jnp.where(failed > 0, int(Flag.SOLVER_NOT_CONVERGED), 0)
     changes: dict[str, Any] = {
         "position": position,
         "orientation": orientation,

@@ -18,6 +18,7 @@ DEFAULTS = {
     "warm_start": True,
     "broadphase": "auto",
     "pair_capacity": None,
+    "solver": "pgs",
 }
 OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}
 
@@ -44,3 +45,8 @@ def test_options_are_frozen_hashable_and_comparable():
 def test_bad_broadphase_is_refused(name, value):
     with pytest.raises(ValueError, match=f"Options.{name}"):
         Options(**{name: value})
+
+
+def test_an_unknown_solver_is_refused():
+    with pytest.raises(ValueError, match=r"Options\.solver must be one of 'pgs', 'converged', got 'newton'"):
+        Options(solver="newton")
