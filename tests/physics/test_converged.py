@@ -50,6 +50,7 @@ def test_heavy_cube_on_a_light_one(precision, dt, gate):
     assert not np.asarray(final.flags).any()
 
 
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
 def test_a_stack_of_ten_boxes_does_not_move(precision, gate):
     """Benchmark B3 at 60 Hz: a stack is an equilibrium; ten sweeps sink into the slop instead."""
     model, state = box_stack(10, half=0.5, options=Options(dt=1 / 60, solver="converged"), friction=0.6)
@@ -69,6 +70,7 @@ def test_tall_stacks_stand(float64, count, gate):
     gate("top, downwards / height", moved[-1, 1] / count, 5e-3)
 
 
+@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
 def test_a_sticking_slab_does_not_creep(precision, gate):
     """Benchmark A10: 0.1 mm in 3 s."""
     angles, friction = [3.0, 10.0, 20.0], 0.5
@@ -95,6 +97,7 @@ def chain(count, heavy):
     return builder.build(converged(dt=1 / 240))
 
 
+@pytest.mark.slow
 def test_a_chain_with_a_heavy_end_does_not_stretch(precision, gate):
     """Ten links with a thousand times their weight at the end: sweeps would need 4e4 of them (benchmark B7)."""
     count = 10
@@ -110,6 +113,7 @@ def test_a_chain_with_a_heavy_end_does_not_stretch(precision, gate):
     assert not np.asarray(states.flags).any()
 
 
+@pytest.mark.slow
 def test_slip_derivative_is_exact(precision, gate):
     """Benchmark C11: the sweeps miss dv/dF by 0.36 %."""
     model, state = slab_on_plane(friction=FRICTION, options=converged(dt=1 / COUNT))
