@@ -9,6 +9,7 @@ import pytest
 
 from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, step
 from tests.gradients.test_stick_slip import COUNT, FACTORS, FRICTION, THRESHOLD, push_with_slopes
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -50,7 +51,7 @@ def test_heavy_cube_on_a_light_one(precision, dt, gate):
     assert not np.asarray(final.flags).any()
 
 
-@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_stack_of_ten_boxes_does_not_move(precision, gate):
     """Benchmark B3 at 60 Hz: a stack is an equilibrium; ten sweeps sink into the slop instead."""
     model, state = box_stack(10, half=0.5, options=Options(dt=1 / 60, solver="converged"), friction=0.6)
@@ -70,7 +71,7 @@ def test_tall_stacks_stand(float64, count, gate):
     gate("top, downwards / height", moved[-1, 1] / count, 5e-3)
 
 
-@pytest.mark.parametrize("precision", ["float32", pytest.param("float64", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_sticking_slab_does_not_creep(precision, gate):
     """Benchmark A10: 0.1 mm in 3 s."""
     angles, friction = [3.0, 10.0, 20.0], 0.5

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Hinge, Plane, SceneBuilder, Sphere, apply_force, is_asleep, rollout, step, wake
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -59,7 +60,7 @@ def same_bits(first, second, names, bodies=slice(None)):
         np.testing.assert_array_equal(getattr(first, name)[bodies], getattr(second, name)[bodies], err_msg=name)
 
 
-@pytest.mark.parametrize("broadphase", ["none", "all_pairs"])
+@pytest.mark.parametrize("broadphase", ["none", pytest.param("all_pairs", marks=pytest.mark.slow)])
 def test_stacks_beside_a_bouncing_ball_do_not_move_a_bit(broadphase):
     model, state = asleep(options=sleepy(broadphase=broadphase))
     bodies = slice(1, 5)
@@ -78,6 +79,7 @@ def test_stacks_beside_a_bouncing_ball_do_not_move_a_bit(broadphase):
     np.testing.assert_array_equal(weight[in_flight], weight[in_flight][0])
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_world_asleep_does_not_change_a_bit(precision):
     model, state = box_stack(3, options=sleepy())
     state = advance(model, state, 120)
@@ -255,7 +257,10 @@ def test_worlds_sleep_on_their_own():
     np.testing.assert_allclose(final.position[1], alone.position, atol=1e-5)
 
 
-@pytest.mark.parametrize("everything", [True, False], ids=["step skipped", "step computed"])
+@pytest.mark.parametrize(
+    "everything",
+    [pytest.param(True, id="step skipped"), pytest.param(False, id="step computed", marks=pytest.mark.slow)],
+)
 def test_gradient_passes_through_a_sleeping_body(float64, everything):
     """The identity for the pose and zero for the velocity; nothing is NaN."""
     if everything:
@@ -283,6 +288,7 @@ def test_gradient_passes_through_a_sleeping_body(float64, everything):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope) if leaf.dtype == float)
 
 
+@pytest.mark.slow
 def test_falling_asleep_and_waking_have_finite_gradients(float64):
     model, state = two_stacks()
 
