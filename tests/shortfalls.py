@@ -43,8 +43,8 @@ SHORTFALLS: dict[str, str] = {
     "3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6",
     "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, "
     "then stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
-    "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter": SWEEPS
-    + "positions differ by 0.03 to 0.7 m after a pile has settled, gate 1e-4",
+    "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter[float32]": "balls of 1, 1 and 100 kg on one "
+    "another are balanced on a point: round-off grows 19-fold in ten steps and the pile falls another way, gate 1e-4",
     **{
         f"tests/unit/test_converged.py::test_contact_laws_hold[{case}-10000.0]": "mass ratio 1e4 among bodies hit at "
         "random points, from nothing: the converged solver reaches its limit of 150 iterations or misses the gate"
