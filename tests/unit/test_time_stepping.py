@@ -156,7 +156,13 @@ def test_interpolation_has_finite_gradients_where_nothing_moved(float64):
     assert all(np.isfinite(part).all() for part in gradient)
 
 
-@pytest.mark.parametrize("scene", [slab_on_plane, lambda **k: box_stack(2, **k)], ids=["slab", "stack"])
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(slab_on_plane, id="slab"),
+        pytest.param(lambda **k: box_stack(2, **k), id="stack", marks=pytest.mark.slow),
+    ],
+)
 def test_zero_time_step_changes_nothing(precision, scene):
     """Not a bit, applied forces included: no time has passed in which they could have acted."""
     model, state = scene(options=Options())
