@@ -145,7 +145,7 @@ def _search(shapes: Difference) -> tuple[Simplex, Array]:
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
     none = jnp.zeros(zero.shape, jnp.int32)
-    simplex = Simplex(vector, (none, none, none), vector, vector, none < 0, none < 0)
+    simplex = Simplex(vector, (none, none, none), vector, vector, none < 0)
     state = _Search(simplex, shapes.position, vector, jnp.asarray(LIFT, number), none < 0, zero + jnp.inf, none < 0)
     state = lax.fori_loop(0, PROOFS + 2, turn, state)
     return state.simplex, state.upper
