@@ -126,14 +126,10 @@ def matched_force(
       scene, close, contacts: static structure, and what is close in this step; all slots.
       force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
     """
-    previous = _previous_places(scene, close.found, pair)
-    parts, slot, place = [], scene.static_slot_count, 0
-    for group, p in zip(scene.compact_groups, close.groups, strict=True):
+    parts, slot = [], scene.static_slot_count
+    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
         rows = range(slot, slot + group.slot_count)
         old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
-        source = gather(previous, p.listed) - place
-        known = p.active & (source >= 0) & (source < group.place_count)
-        source = jnp.clip(source, 0, group.place_count - 1)
 
         def by_point(values: Array, count: int = group.point_count) -> Array:
             return values.reshape(-1, count, values.shape[-1])
@@ -141,7 +137,7 @@ def matched_force(
         old_feature = jnp.where(known[:, None], gather(by_point(old_feature), source), NO_PAIR)
         old_force = old_force.map(lambda x, f=by_point, s=source: gather(f(x), s))
         parts.append(matched_points(old_feature, by_point(new_feature), by_point(active), old_force))
-        slot, place = slot + group.slot_count, place + group.place_count
+        slot += group.slot_count
     return parts
 
 
@@ -152,26 +148,35 @@ def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair:
       scene, close: static structure, and what is close in this step.
       force, feature, pair: what the state keeps: (slot, 3, world), (slot, world) and (place, world).
     """
-    previous = _previous_places(scene, close.found, pair)
     own = range(scene.static_slot_count)
     forces, features = [take(force, own)] if own else [], [take(feature, own)] if own else []
-    slot, place = scene.static_slot_count, 0
-    for group, p in zip(scene.compact_groups, close.groups, strict=True):
-        source = gather(previous, p.listed) - place
-        known = p.active & (source >= 0) & (source < group.place_count)
+    slot = scene.static_slot_count
+    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
         points = jnp.arange(group.point_count, dtype=jnp.int32)[None, :, None]
-        slots = slot + jnp.clip(source, 0, group.place_count - 1)[:, None] * group.point_count + points
+        slots = slot + source[:, None] * group.point_count + points
         slots = slots.reshape(group.slot_count, -1)
         known = jnp.repeat(known, group.point_count, axis=0)
         forces.append(jnp.where(known[:, None], gather(force, slots), 0.0))
         features.append(jnp.where(known, gather(feature, slots), NO_PAIR))
-        slot, place = slot + group.slot_count, place + group.place_count
+        slot += group.slot_count
     worlds = max(values.shape[-1] for values in (*forces, *features))
 
     def join(parts: list[Array]) -> Array:
         return jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in parts])
 
     return join(forces), join(features)
+
+
+def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, Array]]:
+    """For each compact group, (place, world): its place that held the pair in the last step, and whether there was one."""
+    previous = _previous_places(scene, close.found, pair)
+    sources, first = [], 0
+    for group, p in zip(scene.compact_groups, close.groups, strict=True):
+        source = gather(previous, p.listed) - first
+        known = p.active & (source >= 0) & (source < group.place_count)
+        sources.append((jnp.clip(source, 0, group.place_count - 1), known))
+        first += group.place_count
+    return sources
 
 
 def _key(scene: Scene, first: Array, second: Array) -> Array:
