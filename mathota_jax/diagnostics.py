@@ -7,10 +7,9 @@ from jax import Array
 
 from mathota_jax.batching import batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack, vector
-from mathota_jax.collision.narrowphase import find_contacts, join_contacts
-from mathota_jax.constraints import compact
 from mathota_jax.constraints.joint_layout import joint_row_count
 from mathota_jax.constraints.joint_rows import joint_coordinates, moved_by, reactions
+from mathota_jax.constraints.slots import bodies_of_slots, find_slots
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.vector import Vec3, cross, dot
@@ -52,22 +51,12 @@ def contacts(model: Model, state: State) -> Contacts:
 @batch_last
 def _contacts(model: Model, state: State) -> Contacts:
     scene = model.scene
-    bodies = unpack(state)
-    body_a, body_b = (jnp.asarray(side, jnp.int32).reshape(-1, 1) for side in scene.slot_bodies)
     if not scene.slot_count:
         none = state.position[:0, 0]
+        body_a, body_b = bodies_of_slots(scene, None)
         return Contacts(state.position[:0], state.position[:0], none, none > 0, none.astype(jnp.int32), body_a, body_b)
-    parts = []
-    if scene.pair_groups:
-        parts.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
-    if scene.broadphase:
-        close = compact.close_pairs(model, bodies, None)
-        parts += compact.contacts_of(model, bodies, close)
-        body_a, body_b = (
-            jnp.concatenate([jnp.broadcast_to(own, (own.shape[0], more.shape[-1])), more])
-            for own, more in zip((body_a, body_b), compact.slot_bodies(scene, close), strict=True)
-        )
-    found = join_contacts(parts)
+    found, close = find_slots(model, unpack(state), None)
+    body_a, body_b = bodies_of_slots(scene, close)
     position, normal = (jnp.stack(list(v), axis=1) for v in (found.position, found.normal))
     return Contacts(position, normal, found.separation, found.active, found.feature, body_a, body_b)
 

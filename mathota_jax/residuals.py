@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.batching import batch_last
-from mathota_jax.bodies import Bodies, unpack, vector
-from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
-from mathota_jax.constraints import compact, warm_start
+from mathota_jax.bodies import Bodies, unpack
+from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.joints.frames import joint_frames
+from mathota_jax.constraints.slots import bodies_of_slots, find_slots, matched_force
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import gather
 from mathota_jax.spatial.safe import safe_sqrt
@@ -98,24 +98,8 @@ class _Slots(NamedTuple):
 
 def _slots(model: Model, state: State, bodies: Bodies) -> _Slots:
     scene = model.scene
-    old, feature = vector(state.contact_force), state.contact_feature
-    sides = [jnp.asarray(side, jnp.int32)[:, None] for side in scene.slot_bodies]
-    found, close = [], None
-    if scene.pair_groups:
-        found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
-    if scene.broadphase is not None:
-        close = compact.close_pairs(model, bodies, None)
-        found += compact.contacts_of(model, bodies, close)
-        sides = [
-            jnp.concatenate([jnp.broadcast_to(own, (own.shape[0], more.shape[-1])), more])
-            for own, more in zip(sides, compact.slot_bodies(scene, close), strict=True)
-        ]
-    contacts = join_contacts(found)
-    forces = warm_start.matched_force(scene, contacts, old, feature)
-    if close is not None:
-        assert state.contact_pair is not None
-        forces += compact.matched_force(scene, close, contacts, old, feature, state.contact_pair)
-    return _Slots(contacts, sides[0], sides[1], warm_start.join_forces(forces))
+    contacts, close = find_slots(model, bodies, None)
+    return _Slots(contacts, *bodies_of_slots(scene, close), matched_force(scene, contacts, close, state))
 
 
 @batch_last
@@ -157,16 +141,11 @@ def _velocity_at(bodies: Bodies, point: Vec3, body: Array) -> Vec3:
 
 @batch_last
 def _penetration(model: Model, state: State) -> Array:
-    scene, bodies = model.scene, unpack(state)
-    deepest = jnp.zeros(state.position.shape[-1], state.position.dtype)
-    found = []
-    if scene.pair_groups:
-        found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
-    if scene.broadphase is not None:
-        found += compact.contacts_of(model, bodies, compact.close_pairs(model, bodies, None))
-    for contacts in found:
-        deepest = jnp.maximum(deepest, jnp.max(jnp.where(contacts.active, -contacts.separation, 0.0), axis=0))
-    return deepest
+    none = jnp.zeros(state.position.shape[-1], state.position.dtype)
+    if not model.scene.slot_count:
+        return none
+    contacts, _ = find_slots(model, unpack(state), None)
+    return jnp.maximum(none, jnp.max(jnp.where(contacts.active, -contacts.separation, 0.0), axis=0))
 
 
 @batch_last

@@ -11,6 +11,7 @@ from mathota_jax.collision.bounds import admissible_pairs
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import compact
 from mathota_jax.constraints.joint_layout import joint_groups
+from mathota_jax.constraints.slots import bodies_of_slots
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import gather
@@ -117,16 +118,11 @@ def keep_forces(
         changes["joint_force"] = jnp.where(quiet[parent] & quiet[child], old.joint_force, new.joint_force)
     if scene.slot_count:
         force, feature = old.contact_force, old.contact_feature
-        sides = [jnp.asarray(side, jnp.int32)[:, None] for side in scene.slot_bodies]
         if close is not None:
             assert old.contact_pair is not None
             force, feature = compact.carried(scene, close, force, feature, old.contact_pair)
-            compact_sides = compact.slot_bodies(scene, close)
-            sides = [
-                jnp.concatenate([jnp.broadcast_to(own, (own.shape[0], more.shape[-1])), more])
-                for own, more in zip(sides, compact_sides, strict=True)
-            ]
-        keeps = gather(quiet, sides[0]) & gather(quiet, sides[1])
+        first, second = bodies_of_slots(scene, close)
+        keeps = gather(quiet, first) & gather(quiet, second)
         changes["contact_force"] = jnp.where(keeps[:, None], force, new.contact_force)
         changes["contact_feature"] = jnp.where(keeps, feature, new.contact_feature)
     return changes

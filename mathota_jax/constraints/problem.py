@@ -7,10 +7,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia, vector
-from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
+from mathota_jax.bodies import Bodies, Inertia
+from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import compact, contact, joint, joint_layout, joint_rows, row_coefficients, warm_start
 from mathota_jax.constraints.assembly import Side
+from mathota_jax.constraints.slots import find_slots, matched_force
 from mathota_jax.model import Model
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.settle import compute_once
@@ -55,13 +56,7 @@ def constrain(
         )
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
-        found = []
-        if scene.pair_groups:
-            found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
-        if scene.broadphase:
-            close = compact.close_pairs(model, bodies, free)
-            found += compact.contacts_of(model, bodies, close)
-        contacts = join_contacts(found)
+        contacts, close = find_slots(model, bodies, free)
         contacts = contacts._replace(
             **compute_once(
                 {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation},
@@ -95,13 +90,7 @@ def starting_impulses(
         for rows in problem.joint_rows
     ]
     if problem.contacts is not None:
-        old, feature = vector(state.contact_force), state.contact_feature
-        parts = warm_start.matched_force(model.scene, problem.contacts, old, feature)
-        if problem.close is not None and state.contact_pair is not None:
-            parts += compact.matched_force(
-                model.scene, problem.close, problem.contacts, old, feature, state.contact_pair
-            )
-        force = compute_once(warm_start.join_forces(parts), state.position)
+        force = compute_once(matched_force(model.scene, problem.contacts, problem.close, state), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
         if len(model.scene.dynamic_bodies) > 1:
             return warm_start.plausible(problem.rows, inertia, velocity, tuple(start))
