@@ -53,6 +53,42 @@ class Inertia(NamedTuple):
         local = Vec3(local.x / self.moments.x, local.y / self.moments.y, local.z / self.moments.z)
         return self.rotation.apply(local)
 
+    def inverse(self) -> InverseInertia:
+        """The inverse in the world frame."""
+        inverse = Vec3(1.0 / self.moments.x, 1.0 / self.moments.y, 1.0 / self.moments.z)
+        if self.rotation is None:
+            return InverseInertia(self.inverse_mass, inverse, None)
+        axes = list(zip(inverse, self.rotation, strict=True))
+
+        def entry(row: int, column: int) -> Array:
+            terms = [moment * axis[row] * axis[column] for moment, axis in axes]
+            return terms[0] + terms[1] + terms[2]
+
+        diagonal = Vec3(*(entry(k, k) for k in range(3)))
+        return InverseInertia(self.inverse_mass, diagonal, Vec3(entry(1, 2), entry(0, 2), entry(0, 1)))
+
+
+class InverseInertia(NamedTuple):
+    """Inverse mass properties of bodies in the world frame, components of shape (body, world).
+
+    Attributes:
+      inverse_mass: [1/kg].
+      diagonal: of the inverse inertia [1/(kg m^2)].
+      products: its entries yz, xz and xy; None where all bodies are spherical.
+    """
+
+    inverse_mass: Array
+    diagonal: Vec3
+    products: Vec3 | None
+
+    def solve(self, torque: Vec3) -> Vec3:
+        """Inverse inertia times a vector."""
+        along = multiply(self.diagonal, torque)
+        if self.products is None:
+            return along
+        yz, xz, xy = self.products
+        return along + Vec3(xy * torque.y + xz * torque.z, xy * torque.x + yz * torque.z, xz * torque.x + yz * torque.y)
+
 
 class Bodies(NamedTuple):
     """All bodies, static ones included; components of shape (body, world)."""

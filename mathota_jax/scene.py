@@ -78,6 +78,7 @@ class Broadphase(NamedTuple):
       excluded: pairs of bodies that never collide.
       capacity: pairs that can be close at the same time.
       groups: where their contacts go.
+      one_by_one: whether every pair has a turn of its own, or pairs without a common body share one.
     """
 
     method: str
@@ -85,6 +86,7 @@ class Broadphase(NamedTuple):
     excluded: tuple[tuple[int, int], ...]
     capacity: int
     groups: tuple[CompactGroup, ...]
+    one_by_one: bool
 
 
 class JointEntry(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -12,10 +11,9 @@ from mathota_jax.collision.bounds import Shapes, kind_ranges, placed_shapes
 from mathota_jax.collision.narrowphase import ContactSet, flatten
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.scene import CompactGroup, Scene
-from mathota_jax.spatial.indexing import gather
+from mathota_jax.spatial.indexing import gather_together
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion
-from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 
 
@@ -40,9 +38,7 @@ def compact_contacts(
 
     def placed(kind: str, index: Array) -> tuple[dict[str, Any], Pose]:
         everything = placed_shapes(scene, shapes, kind, ranges[kind], position, orientation)
-        local = index - ranges[kind].start
-        # A gather is stored: computed again in every kernel, it would cost more than all that follows.
-        return jax.tree.map(lambda x: compute_once(chosen := gather(x, local), chosen), everything)
+        return gather_together(everything, index - ranges[kind].start)
 
     (a, pose_a), (b, pose_b) = placed(group.kind_a, pair[0]), placed(group.kind_b, pair[1])
     manifold = PAIRS[group.kind_a, group.kind_b].function(a, pose_a, b, pose_b)

@@ -12,14 +12,17 @@ from mathota_jax.geometry import SHAPES
 from mathota_jax.options import Options
 from mathota_jax.scene import Broadphase, CompactGroup, ShapeEntry, Tier
 
-OWN_SLOTS_UP_TO = 300
-"""Pairs that keep slots of their own; beyond, finding the close ones is cheaper than solving all."""
+OWN_SLOTS_UP_TO = 20
+"""Pairs that keep slots of their own; beyond, finding the close ones is cheaper than solving all (measured with stacks)."""
 
 UNPLANNED_KINDS = ("plane", "heightfield", "polyhedron")
 """Kinds whose pairs always have slots: unbounded ones touch everything, faces of polyhedra are static."""
 
 PAIRS_PER_SHAPE = 8
 """Close pairs for each moving shape: equal spheres have at most 6, boxes somewhat more, their bounds touch sooner."""
+
+ONE_BY_ONE_UP_TO = 300
+"""Pairs up to which each has a turn of its own: worlds side by side keep the processor busy, and no place stays empty."""
 
 FULL_TURNS = 12
 """Turns of a sweep that hold as many pairs as can be without sharing a body; the later ones are narrower."""
@@ -55,14 +58,22 @@ def plan_broadphase(
         return None
     sizes = [reach[entries[k].body] for k in shapes]
     method = choose_method(moving, fixed, sizes) if options.broadphase == "auto" else options.broadphase
-    groups = _groups([(entries[k].kind, static[entries[k].body]) for k in shapes], sizes)
-    capacity = options.pair_capacity or max(PAIRS_PER_SHAPE * moving, OWN_SLOTS_UP_TO)
+    capacity = options.pair_capacity or max(PAIRS_PER_SHAPE * moving, ONE_BY_ONE_UP_TO)
     capacity = min(capacity, pair_count)
-    return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups)
+    one_by_one = capacity <= ONE_BY_ONE_UP_TO
+    groups = _groups(
+        [(entries[k].kind, static[entries[k].body]) for k in shapes], sizes, capacity if one_by_one else None
+    )
+    return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups, one_by_one)
 
 
-def _groups(shapes: Sequence[tuple[str, bool]], sizes: Sequence[float]) -> tuple[CompactGroup, ...]:
-    """Groups by kinds and by the number of moving bodies, those with one first, as in `solver.table.make_tables`."""
+def _groups(
+    shapes: Sequence[tuple[str, bool]], sizes: Sequence[float], capacity: int | None
+) -> tuple[CompactGroup, ...]:
+    """Groups by kinds and by the number of moving bodies, those with one first, as in `solver.table.make_tables`.
+
+    `capacity` is the number of pairs if each has a turn of its own, else None.
+    """
     kinds = list(dict.fromkeys(kind for kind, _ in shapes))
     count = {key: sum(shape == key for shape in shapes) for key in set(shapes)}
     groups = []
@@ -84,7 +95,7 @@ def _groups(shapes: Sequence[tuple[str, bool]], sizes: Sequence[float]) -> tuple
                     "bodies of one of them"
                 )
             if pairs:
-                tiers = _tiers(widest, partners, side_count, sizes)
+                tiers = (Tier(min(pairs, capacity), 1),) if capacity else _tiers(widest, partners, side_count, sizes)
                 groups.append(CompactGroup(a, b, PAIRS[a, b].point_count, side_count, tiers))
     return tuple(groups)
 

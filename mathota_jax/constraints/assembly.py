@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.bodies import Inertia
+from mathota_jax.bodies import Inertia, InverseInertia
 from mathota_jax.solver.pgs import Places
 from mathota_jax.solver.table import EMPTY, Table, TracedTable
-from mathota_jax.spatial.indexing import gather, take
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.indexing import gather_together, take, unstack
 from mathota_jax.spatial.vector import Vec3, dot
 
 
@@ -25,7 +24,7 @@ class Side(NamedTuple):
     angular: Vec3 | None
 
 
-def respond(side: Side, inertia: Inertia) -> Side:
+def respond(side: Side, inertia: Inertia | InverseInertia) -> Side:
     """``M^-1 J^T`` for the Jacobian of one row; `inertia` holds the body of each column."""
     angular = None if side.angular is None else inertia.solve(side.angular)
     return Side(side.linear * inertia.inverse_mass, angular)
@@ -53,13 +52,8 @@ def select_blocks(table: Table | TracedTable, side: int, tree: Any, places: Plac
 
 def gather_columns(table: TracedTable, index: Array, tree: Any) -> Any:
     """Rows (turn * column, world) of arrays by an index (turn, constraint, world)."""
-    flat = index.reshape(-1, index.shape[-1])
-
-    def columns(values: Array) -> Array:
-        chosen = gather(values, flat)
-        return compute_once(jnp.repeat(chosen, table.together, axis=0), chosen)
-
-    return jax.tree.map(columns, tree)
+    chosen = gather_together(tree, index.reshape(-1, index.shape[-1]))
+    return jax.tree.map(lambda values: jnp.repeat(values, table.together, axis=0), chosen)
 
 
 def collect(tables: Sequence[Table | TracedTable], values: Sequence[Array], slot_count: int) -> Array:
@@ -75,6 +69,15 @@ def pack_sides(table: Table | TracedTable, rows: Sequence[Side], worlds: int) ->
     """(turn, row, component, column, world) from one `Side` for each row, components (turn * column, world)."""
     components = [tuple(row.linear) if row.angular is None else (*row.linear, *row.angular) for row in rows]
     return jnp.stack([pack_scalars(table, row, worlds) for row in components], axis=1)
+
+
+def unpack_sides(packed: Array) -> list[Side]:
+    """One `Side` for each row, components (turn * column, world): the inverse of `pack_sides`."""
+    rows = []
+    for row in unstack(packed, 1):
+        components = [part.reshape(-1, part.shape[-1]) for part in unstack(row, 1)]
+        rows.append(Side(Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None))
+    return rows
 
 
 def pack_scalars(table: Table | TracedTable, values: Sequence[Array], worlds: int) -> Array:

@@ -204,13 +204,17 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     blocks = np.asarray([block_of.get(body, block_count) for body in admissible.bodies], np.int32)
     group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
     active = found.active
-    ends = [jnp.asarray(blocks)[side] for side in (found.first, found.second)]
-    node_count = len(scene.compact_groups) * block_count
-    nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
     turn_counts = [sum(tier.turn_count for tier in group.tiers) for group in scene.compact_groups]
     turn_count = max(turn_counts)
-    priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
-    colour = edge_colours(nodes, priority, active, node_count, turn_count)  # type: ignore[arg-type]
+    assert scene.broadphase is not None
+    if scene.broadphase.one_by_one:
+        colour = _ranks(group_of_pair, active, len(turn_counts))
+    else:
+        ends = [jnp.asarray(blocks)[side] for side in (found.first, found.second)]
+        node_count = len(scene.compact_groups) * block_count
+        nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
+        priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
+        colour = edge_colours(nodes, priority, active, node_count, turn_count)  # type: ignore[arg-type]
 
     # Sorted by group, turn and place in the list: the pairs of a turn follow one another.
     code = jnp.where(active, group_of_pair * (turn_count + 1) + colour, len(turn_counts) * (turn_count + 1))
@@ -241,6 +245,15 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
         lost |= (counts[turn + turn_counts[number] : turn + turn_count + 1] > 0).any(0)
         groups.append(_group_places(scene, group, found, jnp.concatenate(held), jnp.concatenate(listed), tables, sizes))
     return groups, lost
+
+
+def _ranks(group_of_pair: Array | int, active: Array, group_count: int) -> Array:
+    """(listed pair, world) number of the pair among those of its group."""
+    rank = jnp.zeros(active.shape, jnp.int32)
+    for group in range(group_count):
+        mine = active & (group_of_pair == group)
+        rank = jnp.where(mine, jnp.cumsum(mine.astype(jnp.int32), axis=0) - 1, rank)
+    return rank
 
 
 def _group_places(

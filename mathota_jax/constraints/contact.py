@@ -9,29 +9,30 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.bodies import Inertia
+from mathota_jax.bodies import InverseInertia
 from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
     Side,
     collect,
     gather_columns,
-    inner,
     pack_scalars,
     pack_sides,
     respond,
     select,
     select_blocks,
+    unpack_sides,
 )
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
+from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Places, Rows
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
@@ -49,12 +50,19 @@ ROUND_OFF = 64
 
 
 class Motion(NamedTuple):
-    """Moving bodies at the start of a step: positions, and velocities now and at its end if nothing constrained them."""
+    """Moving bodies at the start of a step.
+
+    Attributes:
+      position: of their centres of mass.
+      velocity, free_velocity: (component, block, world) now, and at the end of the step if nothing constrained them.
+      inertia: inverse, in the world frame.
+      gravity: [m/s^2].
+    """
 
     position: Vec3
-    velocity: Side
-    free_velocity: Side
-    inertia: Inertia
+    velocity: Array
+    free_velocity: Array
+    inertia: InverseInertia
     gravity: Vec3
 
 
@@ -132,45 +140,38 @@ def contact_rows(
     """Rows of the contacts in one table; `pairs` are those of a traced table."""
     places = None if pairs is None else pairs.places
     chosen: ContactSet = select(table, contacts)
-    worlds = max(
-        chosen.separation.shape[-1], motion.velocity.linear.x.shape[-1], motion.free_velocity.linear.x.shape[-1]
-    )
+    worlds = max(chosen.separation.shape[-1], motion.velocity.shape[-1], motion.free_velocity.shape[-1])
     normal = chosen.normal
     directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
     rotating = couples_rotation(scene)
-    jacobians, responses, start, free = [], [], jnp.zeros(()), jnp.zeros(())
+    jacobians, responses = [], []
     for side, sign in enumerate(_signs(scene, table, pairs)):
-        inertia = select_blocks(table, side, motion.inertia, places)
+        position, inertia = select_blocks(table, side, (motion.position, motion.inertia), places)
         # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
         surface = chosen.position + normal * (jnp.maximum(chosen.separation, 0.0) * (0.5 * sign))
-        arm = compute_once(surface - select_blocks(table, side, motion.position, places), chosen.separation)
-        jacobian = [
-            Side(direction * sign, compute_once(cross(arm, direction) * sign, arm.x) if rotating else None)
-            for direction in directions
-        ]
-        jacobians.append(jacobian)
-        responses.append([respond(row, inertia) for row in jacobian])
-        start = start + inner(jacobian[0], select_blocks(table, side, motion.velocity, places))
-        free = free + inner(jacobian[0], select_blocks(table, side, motion.free_velocity, places))
-
+        arm = compute_once(surface - position, chosen.separation)
+        sides = [Side(direction * sign, cross(arm, direction) * sign if rotating else None) for direction in directions]
+        jacobians.append(jacobian := compute_once(pack_sides(table, sides, worlds), chosen.separation))
+        responses.append(pack_sides(table, [respond(row, inertia) for row in unpack_sides(jacobian)], worlds))
+    start, free = (
+        normal_velocity(table, jacobians, places, velocity) for velocity in (motion.velocity, motion.free_velocity)
+    )
     target, lever = _impact(scene, table, model, chosen, motion, start, free, pairs)
-    active = chosen.active.astype(normal.x.dtype)
+    active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     normal_mass = active / _row_bound(table, jacobians, responses, active, (0,))
     bias = [-target]
     if scene.friction:
         law = Cone(
-            normal_mass=pack_scalars(table, [normal_mass], worlds)[:, 0],
-            tangent_mass=pack_scalars(
-                table, [active / _row_bound(table, jacobians, responses, active, (1, 2))], worlds
-            )[:, 0],
+            normal_mass=normal_mass,
+            tangent_mass=active / _row_bound(table, jacobians, responses, active, (1, 2)),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
-        law = _push_only(pack_scalars(table, [normal_mass], worlds))
+        law = _push_only(normal_mass[:, None])
     rows = Rows(
-        jacobian=tuple(pack_sides(table, jacobian, worlds) for jacobian in jacobians),
-        response=tuple(pack_sides(table, response, worlds) for response in responses),
+        jacobian=tuple(jacobians),
+        response=tuple(responses),
         bias=pack_scalars(table, bias, worlds),
         law=law,
         table=table,
@@ -188,14 +189,23 @@ def contact_rows(
     )
 
 
+def normal_velocity(
+    table: Table | TracedTable, jacobians: Sequence[Array], places: Places | None, velocity: Array
+) -> Array:
+    """(turn * column, world) along the normals, of blocks (component, block, world)."""
+    normals = [side[:, :1] for side in jacobians]
+    along = pgs.project_blocks(table, normals, places, velocity)
+    return along.reshape(-1, along.shape[-1])
+
+
 def _row_bound(
     table: Table | TracedTable,
-    jacobians: list[list[Side]],
-    responses: list[list[Side]],
+    jacobians: Sequence[Array],
+    responses: Sequence[Array],
     active: Array,
     rows: tuple[int, ...],
 ) -> Array:
-    """Bound of the response of each point to impulses on all points of its manifold, along the given rows.
+    """Bound (turn, column, world) of the response of each point to impulses on all points of its manifold, along `rows`.
 
     The points of a manifold are solved together, which keeps the symmetry of a stack: solved one after the other they
     tilt it. A step divided by the sum of the norms of the blocks ``J_i M^-1 J_j^T`` over j can not overshoot
@@ -204,40 +214,37 @@ def _row_bound(
     """
     count = table.together
     # The length of a step does not move the fixed point: its derivative is not worth computing.
-    jacobians, responses = jax.lax.stop_gradient((jacobians, responses))
-    total = _largest_eigenvalue(jacobians, responses, rows)
+    sides = [
+        (_components(jacobian), _components(response))
+        for jacobian, response in zip(*jax.lax.stop_gradient((jacobians, responses)), strict=True)
+    ]
+
+    def entry(row: int, column: int, first: tuple[int, ...] = (), second: tuple[int, ...] = ()) -> Array:
+        """Response of a row to a column: of each point, or, with points apart on two axes, to each point."""
+        terms = [
+            a.reshape(*a.shape[:1], *first, a.shape[-1]) * b.reshape(*b.shape[:1], *second, b.shape[-1])
+            for jacobian, response in sides
+            for a, b in zip(jacobian[row], response[column], strict=True)
+        ]
+        return functools.reduce(jnp.add, terms)
+
+    own, other = (-1, count, 1), (-1, 1, count)
+    total = _largest_eigenvalue(lambda row, column: entry(row, column, (-1,), (-1,)), rows)
     if count == 1:
         return total
-    own, neighbour = _by_point(jacobians, count, 2), _by_point(responses, count, 0)
-    squared = jnp.zeros(())
-    for row in rows:
-        for column in rows:
-            block = sum((inner(j[row], r[column]) for j, r in zip(own, neighbour, strict=True)), jnp.zeros(()))
-            squared = squared + block * block
-    others = 1.0 - np.eye(count)[:, None, :, None]
-    norms = safe_sqrt(squared) * (others * _by_point(active, count, 0))
-    norms = norms.reshape(count, len(table.order), norms.shape[-1])
-    return functools.reduce(jnp.add, unstack(norms, 0), total) / RELAXATION
+    squared = sum((entry(row, column, own, other) ** 2 for row in rows for column in rows), jnp.zeros(()))
+    others = 1.0 - np.eye(count)[:, :, None]
+    norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], *other, active.shape[-1]))
+    return functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total) / RELAXATION
 
 
-def _by_point(tree: Any, count: int, axis: int) -> Any:
-    """Values (column, world) as (point, manifold, point, world) that vary along one of the two point axes."""
-
-    def spread(value: Array) -> Array:
-        if jnp.ndim(value) < 2 or value.shape[0] == 1:
-            return value
-        split = value.reshape(-1, count, value.shape[-1])
-        return split[None] if axis == 2 else jnp.swapaxes(split, 0, 1)[:, :, None]
-
-    return jax.tree.map(spread, tree)
+def _components(packed: Array) -> list[list[Array]]:
+    """Components (turn, column, world) of each row."""
+    return [unstack(row, 1) for row in unstack(packed, 1)]
 
 
-def _largest_eigenvalue(jacobians: list[list[Side]], responses: list[list[Side]], rows: tuple[int, ...]) -> Array:
-    """Of the response ``J M^-1 J^T`` of one point along one or two rows."""
-
-    def entry(row: int, column: int) -> Array:
-        return sum((inner(j[row], r[column]) for j, r in zip(jacobians, responses, strict=True)), jnp.zeros(()))
-
+def _largest_eigenvalue(entry: Callable[[int, int], Array], rows: tuple[int, ...]) -> Array:
+    """Of the response of one point along one or two rows, given by its entries."""
     if len(rows) == 1:
         return entry(rows[0], rows[0])
     first, second, coupling = entry(rows[0], rows[0]), entry(rows[1], rows[1]), entry(rows[0], rows[1])

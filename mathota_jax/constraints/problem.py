@@ -7,10 +7,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia
+from mathota_jax.bodies import Bodies, Inertia, pack_blocks
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import compact, contact, joint, joint_layout, joint_rows, row_coefficients, warm_start
-from mathota_jax.constraints.assembly import Side
 from mathota_jax.constraints.slots import find_slots, matched_force
 from mathota_jax.model import Model
 from mathota_jax.solver.pgs import Rows
@@ -65,9 +64,13 @@ def constrain(
         )
         if scene.options.continuous:
             contacts = contact.near_contacts(scene, model, contacts)
-        motion = contact.Motion(
-            blocks.position, Side(blocks.velocity, blocks.angular_velocity), Side(*free), inertia, gravity
+        rotating = contact.couples_rotation(scene)
+        now, then = (
+            pack_blocks(linear, angular if rotating else None)
+            for linear, angular in ((blocks.velocity, blocks.angular_velocity), free)
         )
+        inverse = compute_once(inertia.inverse(), state.position)
+        motion = contact.Motion(blocks.position, now, then, inverse, gravity)
         contact_rows = [
             contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)
         ]

@@ -11,7 +11,7 @@ from mathota_jax.bodies import Bodies, Inertia
 from mathota_jax.spatial.quaternion import Quaternion, exponential, logarithm, multiply, normalize, to_matrix
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.vector import Vec3, cross, dot, norm, where
+from mathota_jax.spatial.vector import Vec3, cross, dot, where
 from mathota_jax.spatial.vector import multiply as componentwise
 
 LARGEST_ANGLE = 0.5
@@ -96,8 +96,7 @@ def _fast_rotation_vector(inverse: Vec3, start: Vec3, dt: Array, theta: Vec3) ->
     One step of order four over radians conserves the momentum and nothing else: where it ends up by chance the energy is
     anything between the momentum squared over the largest and the smallest moment.
     """
-    largest = jnp.maximum(jnp.maximum(inverse.x, inverse.y), inverse.z)
-    angle = lax.stop_gradient(norm(start) * largest * dt)
+    angle = lax.stop_gradient(_largest_rate(inverse, start) * dt)
     fast = settle(jnp.where((angle > LARGEST_ANGLE) & (angle < jnp.inf), 1.0, 0.0)) > 0.5
 
     def in_parts(inverse: Vec3, start: Vec3, dt: Array, theta: Vec3) -> Vec3:
@@ -114,6 +113,19 @@ def _fast_rotation_vector(inverse: Vec3, start: Vec3, dt: Array, theta: Vec3) ->
         return where(fast, logarithm(turned), theta)
 
     return lax.cond(fast.any(), in_parts, lambda inverse, start, dt, theta: theta, inverse, start, dt, theta)
+
+
+def _largest_rate(inverse: Vec3, momentum: Vec3) -> Array:
+    """Largest angular speed of a free body on its way, from its momentum and energy.
+
+    The squares of the components of the momentum add up to that of the momentum, divided by the moments to twice the
+    energy: the square of the speed, linear in them, is largest with the largest and the smallest moment alone. (The momentum
+    over the smallest moment would be thousands of times too much for a thin rod that does not spin.)
+    """
+    largest = jnp.maximum(jnp.maximum(inverse.x, inverse.y), inverse.z)
+    smallest = jnp.minimum(jnp.minimum(inverse.x, inverse.y), inverse.z)
+    energy = dot(momentum, componentwise(inverse, momentum))
+    return jnp.sqrt(jnp.maximum(energy * largest + (energy - dot(momentum, momentum) * largest) * smallest, 0.0))
 
 
 def _within_half_turn(theta: Vec3) -> Vec3:

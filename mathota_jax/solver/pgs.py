@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -31,6 +31,10 @@ from mathota_jax.struct import pytree, static
 
 UNROLLED_TURNS = 12
 """Largest number of turns that a sweep unrolls."""
+
+MASKED_BLOCKS = 32
+"""Largest number of velocity blocks among which traced ones are selected by masks, side by side for all worlds; beyond,
+one world after the other by gather and scatter."""
 
 
 @pytree
@@ -155,7 +159,10 @@ def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, 
         blocks, values = jax.tree.map(
             lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), (places.blocks, (*scanned, impulse))
         )
-        velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, values)
+        # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
+        *values, old = values
+        old = store(old, old)
+        velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, (*values, old))
         return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
 
     return lax.fori_loop(0, places.turns, body, (velocity, impulse))
@@ -169,9 +176,10 @@ def _turn(
     error = bias
     for side_jacobian, side_blocks in zip(jacobian, blocks, strict=True):
         error = error + _project(side_jacobian, _gather(velocity, side_blocks, together))
-    new = update(coefficients, impulse, error)
-    # Stored, because every later row of the sweep depends on it: a chain of rows must not be computed again for each.
-    new = store(new, response[0][:, 0])
+    # Stored, because each row of the law reads several errors, and every later turn the impulses: what is not stored is
+    # computed again for each.
+    error = store(error, response[0][:, 0])
+    new = store(update(coefficients, impulse, error), response[0][:, 0])
     return _receive(velocity, receivers, [_respond(side, new - impulse, together) for side in response]), new
 
 
@@ -192,19 +200,32 @@ def _respond(response: Array, impulse: Array, together: int) -> Array:
 
 def _gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
     """Velocities (component, column, world) of the blocks of a turn; padding reads any block (it has no impulse)."""
+    last = velocity.shape[1] - 1
     if isinstance(blocks, jax.Array) and blocks.ndim == 2:
-        index = jnp.minimum(blocks, velocity.shape[1] - 1)[None]
-        return jnp.repeat(jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds"), together, axis=1)
-    if isinstance(blocks, tuple):
-        clipped = [min(block, velocity.shape[1] - 1) for block in blocks]
-        return take(velocity, clipped, axis=1)
-    return jnp.take(velocity, blocks, axis=1, mode="clip")
+        if velocity.shape[1] <= MASKED_BLOCKS:
+            parts = [jnp.where(blocks == k, part[:, None], 0.0) for k, part in enumerate(unstack(velocity, 1))]
+            chosen = functools.reduce(jnp.add, parts)
+            chosen = store(chosen, chosen)
+        else:
+            index = jnp.minimum(blocks, last)[None]
+            chosen = jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds")
+    elif isinstance(blocks, tuple):
+        chosen = take(velocity, [min(block, last) for block in blocks[::together]], axis=1)
+    else:
+        chosen = jnp.take(velocity, blocks[::together], axis=1, mode="clip")
+    return chosen if chosen.shape[1] == 1 else jnp.repeat(chosen, together, axis=1)  # one block broadcasts
 
 
 def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
     """Adds to each block the change by the constraint that acts on it."""
     block_count = velocity.shape[1]
     if isinstance(receivers, tuple):
+        if velocity.shape[1] <= MASKED_BLOCKS:
+            numbers = jnp.arange(block_count)[:, None]
+            for blocks, change in zip(receivers, changes, strict=True):
+                for block, part in zip(unstack(blocks, 0), unstack(store(change, change), 1), strict=True):
+                    velocity = velocity + jnp.where(block == numbers, part[:, None], 0.0)
+            return velocity
         # In a turn of places no block occurs twice, so the order in which a scatter adds does not matter.
         lanes = jnp.arange(velocity.shape[2])
         for blocks, change in zip(receivers, changes, strict=True):
@@ -221,12 +242,19 @@ def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
 
 def row_velocity(group: Rows, velocity: Array) -> Array:
     """``J v`` of all rows of a group: (turn, row, column, world)."""
-    if group.places is not None:
-        together = group.table.together
-        gathered = [jax.vmap(lambda b: _gather(velocity, b, together))(blocks) for blocks in group.places.blocks]
-        return functools.reduce(jnp.add, [_project(j, v) for j, v in zip(group.jacobian, gathered, strict=True)])
-    sides = zip(group.jacobian, group.table.blocks, strict=True)
-    return functools.reduce(jnp.add, [_project(jacobian, _all_turns(velocity, blocks)) for jacobian, blocks in sides])
+    return project_blocks(group.table, group.jacobian, group.places, velocity)
+
+
+def project_blocks(
+    table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
+) -> Array:
+    """``J v`` (turn, row, column, world) for rows that a table visits; arguments as in `Rows`."""
+    if isinstance(table, TracedTable):
+        assert places is not None
+        gathered = [jax.vmap(lambda b: _gather(velocity, b, table.together))(blocks) for blocks in places.blocks]
+    else:
+        gathered = [_all_turns(velocity, blocks) for blocks in table.blocks]
+    return functools.reduce(jnp.add, [_project(j, v) for j, v in zip(jacobian, gathered, strict=True)])
 
 
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mathota_jax.spatial.settle import store
+
 
 def take(tree: Any, indices: Sequence[int] | np.ndarray, axis: int = 0) -> Any:
     """Rows `indices` (static) along `axis` of every array of a pytree.
@@ -46,6 +48,20 @@ def gather(values: Array, index: Array) -> Array:
     if index.shape[-1] == 1:
         return values.at[index[:, 0]].get(mode="promise_in_bounds")
     return jnp.take_along_axis(values, index, axis=0, mode="promise_in_bounds")
+
+
+def gather_together(tree: Any, index: Array) -> Any:
+    """Rows of all arrays (row, world or 1) of a pytree by traced indices (place, world), in one operation.
+
+    The result is stored: a gather computed again in every kernel that reads it costs more than what follows, and one for
+    each array costs the compiler a kernel each.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    worlds = max(index.shape[-1], *(leaf.shape[-1] for leaf in leaves))
+    rows = jnp.stack([jnp.broadcast_to(leaf, (leaf.shape[0], worlds)) for leaf in leaves])
+    places = jnp.broadcast_to(index, (index.shape[0], worlds))[None]
+    chosen = jnp.take_along_axis(rows, places, axis=1, mode="promise_in_bounds")
+    return jax.tree.unflatten(structure, unstack(store(chosen, chosen), 0))
 
 
 def unstack(array: Array, axis: int) -> list[Array]:

@@ -241,7 +241,7 @@ def test_kinds_share_a_broadphase(gate):
 
 
 def test_small_scenes_have_no_broadphase():
-    for count, has_one in ((8, False), (24, False), (27, True)):
+    for count, has_one in ((6, False), (7, True), (27, True)):
         model, state = heap(count)
         assert (model.scene.broadphase is not None) == has_one, count
         assert (state.contact_pair is not None) == has_one
