@@ -18,7 +18,7 @@ from mathota_jax.collision.convex.epa import epa
 from mathota_jax.collision.convex.gjk import Simplex, gjk
 from mathota_jax.collision.convex.polytope import Polytope
 from mathota_jax.collision.convex.separating_axis import separating_axis
-from mathota_jax.spatial.vector import Vec3, dot, norm
+from mathota_jax.spatial.vector import Vec3, dot
 
 POLYTOPE_ITERATIONS = 16
 CURVED_ITERATIONS = {"float32": 24, "float64": 40}
@@ -38,6 +38,7 @@ fails to prove its answer; further apart the polish repairs it."""
 
 
 class _Lifted(NamedTuple):
+    turn: Array
     simplex: Simplex
     start: Vec3
     shift: Vec3
@@ -55,34 +56,33 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
         tolerance: An answer is good to this share of the size.
     """
 
-    def turn(index: Array, state: _Lifted) -> _Lifted:
+    def turn(state: _Lifted) -> _Lifted:
         found = gjk(shapes, state.start, state.shift, ~state.done, POLYTOPE_ITERATIONS)
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), found, state.simplex)
-        apart, stalled = _stalled(shapes, found, tolerance)
-        first = index == 0
-        wanted = first & (found.overlap | stalled)
+        first = state.turn == 0
+        wanted = first & (found.overlap | _stalled(shapes, found, tolerance))
         axis = separating_axis(shapes, a, b, wanted)
-        upper = jnp.where(first, jnp.where(found.overlap, axis.separation, apart), state.upper)
+        upper = jnp.where(first, jnp.where(found.overlap, axis.separation, found.distance), state.upper)
         shift = axis.direction * (LIFT - axis.separation)
-        return _Lifted(simplex, axis.direction, shift, upper, ~wanted)
+        return _Lifted(state.turn + 1, simplex, axis.direction, shift, upper, ~wanted)
 
     # Both searches are turns of one loop, so that they are compiled once.
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
-    state = _Lifted(_no_simplex(vector), shapes.position, vector, zero, zero > 0)
-    state = lax.fori_loop(0, 2, turn, state)
+    state = _Lifted(jnp.zeros((), jnp.int32), _no_simplex(vector), shapes.position, vector, zero, zero > 0)
+    state = lax.while_loop(lambda s: (s.turn < 2) & ~jnp.all(s.done), turn, state)
     return state.simplex, state.upper
 
 
-def _stalled(shapes: Difference, found: Simplex, tolerance: float) -> tuple[Array, Array]:
-    """Distance of the closest points, and whether the search stalled on a needle of a simplex, close to touch."""
-    apart = norm(found.point_b - found.point_a)
-    return apart, (apart < CLOSE) & (dot(found.direction, shapes.least(found.direction)[0]) < apart - tolerance)
+def _stalled(shapes: Difference, found: Simplex, tolerance: float) -> Array:
+    """Whether the search stalled on a needle of a simplex, close to touch: its direction proves nothing."""
+    reach = dot(found.direction, shapes.least(found.direction)[0])
+    return (found.distance < CLOSE) & (reach < found.distance - tolerance)
 
 
 def _no_simplex(zero: Vec3) -> Simplex:
     none = jnp.zeros(zero.x.shape, jnp.int32)
-    return Simplex(zero, (none, none, none), zero, zero, none < 0)
+    return Simplex(zero, (none, none, none), zero, zero, zero.x, none < 0)
 
 
 class _Search(NamedTuple):
@@ -112,12 +112,11 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Array]
         found = gjk(shapes, state.start, state.shift, ~state.done, CURVED_ITERATIONS[str(number)])
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), found, state.simplex)
         first = index == 0
-        apart, stalled = _stalled(shapes, found, tolerance)
         overlap = jnp.where(first, found.overlap, state.overlap)
-        wanted = jnp.where(first, found.overlap | stalled, ~state.done)
+        wanted = jnp.where(first, found.overlap | _stalled(shapes, found, tolerance), ~state.done)
         limit = jnp.where(first, GLANCE, jnp.where(index <= PROOFS, PROOF, 0))
         least = epa(shapes, simplex.direction, wanted, limit, PROOF, tolerance)
-        upper = jnp.where(first, jnp.where(overlap, jnp.inf, apart), state.upper)
+        upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
         upper = jnp.where(overlap & wanted, jnp.minimum(upper, -least.lower), upper)
         # The first seed is none. Later a lane keeps the simplex of its seed unless the search found a better direction.
         done = ~wanted | (~first & (least.depth >= least.seed_depth - tolerance))
@@ -129,8 +128,6 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Array]
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
     no = zero > 0
-    state = _Search(
-        _no_simplex(vector), shapes.position, vector, jnp.asarray(LIFT, number), none < 0, zero + jnp.inf, none < 0
-    )
+    state = _Search(_no_simplex(vector), shapes.position, vector, jnp.asarray(LIFT, number), no, zero + jnp.inf, no)
     state = lax.fori_loop(0, PROOFS + 2, turn, state)
     return state.simplex, state.upper

@@ -8,6 +8,7 @@ of B reversed, or where an arc of A crosses a reversed arc of B, along the cross
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -20,7 +21,7 @@ from mathota_jax.collision.convex.polytope import Edges, Polytope
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, where
 
-LANES = 512
+LANES = 256
 """Pairs that are tested at a time: their edges fit into the cache of a core."""
 ARC_ROUNDING = 8.0
 """Arcs must cross by this many round-offs. A crossing within less of an end is no deeper than the face there, to the same
@@ -54,14 +55,15 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
         The axis, in the frame of A; anything finite where it is not wanted.
     """
     placed = _Placed(a, b, shapes.rotation, shapes.position)
-    lanes = wanted.shape
-    total = wanted.size
-    if total <= LANES:
-        none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
-        return lax.cond(jnp.any(wanted), _best, lambda _: none, placed)
+    none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
+    test = _best if wanted.size <= LANES else functools.partial(_best_of_some, wanted)
+    return lax.cond(jnp.any(wanted), test, lambda _: none, placed)
 
+
+def _best_of_some(wanted: Array, placed: _Placed) -> Axis:
+    """`_best` of the pairs that are wanted, some at a time; zero elsewhere."""
+    lanes, total = wanted.shape, wanted.size
     flat = jax.tree.map(lambda x: _flatten(x, lanes), placed)
-    number = shapes.position.x.dtype
     order = jnp.argsort(~wanted.reshape(-1), stable=True)
     count = jnp.sum(wanted, dtype=jnp.int32)
 
@@ -72,7 +74,7 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
         axis = _best(some)
         return turn + 1, jax.tree.map(lambda all_, new: all_.at[0, chosen].set(new[0]), found, axis)
 
-    zero = jnp.zeros((1, total), number)
+    zero = jnp.zeros((1, total), placed.position.x.dtype)
     state = jnp.zeros((), jnp.int32), Axis(Vec3(zero, zero, zero), zero)
     _, found = lax.while_loop(lambda s: s[0] * LANES < count, test_some, state)
     return jax.tree.map(lambda x: x.reshape(lanes), found)
