@@ -87,9 +87,7 @@ def mjx_boxes(scene: dict[str, Any]) -> tuple[Block, float]:
         matrices = Rotation.from_quat(scene["q" + side][:, [1, 2, 3, 0]]).as_matrix()
         arrays = (scene["p" + side], matrices, scene[side]["half_extents"])
         infos.append(mesh.box(collision_types.GeomInfo(*(jnp.asarray(x, jnp.float32) for x in arrays))))  # pyright: ignore[reportOptionalMemberAccess, reportPossiblyUnbound]
-    axes = [
-        jax.tree.map(lambda _: None, info).replace(pos=0, mat=0, size=0, face=0, vert=0) for info in infos
-    ]
+    axes = [jax.tree.map(lambda _: None, info).replace(pos=0, mat=0, size=0, face=0, vert=0) for info in infos]
     started = time.process_time()
     manifold = jax.jit(jax.vmap(collision_convex._box_box, in_axes=axes)).lower(*infos).compile()  # pyright: ignore[reportPossiblyUnbound]
     seconds = time.process_time() - started

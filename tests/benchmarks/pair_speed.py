@@ -36,6 +36,15 @@ CHECKED = 100
 PEER_ROUNDS = 5
 
 
+def _unit_points(count: int) -> np.ndarray:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+POINTS = {count: _unit_points(count) for count in (16, 64)}
+"""Corners of the hulls, on the unit sphere."""
+
+
 class Case(NamedTuple):
     """Kinds, distance of the centres [m] of shapes about 1 m in radius, and corners of the hulls."""
 
@@ -92,7 +101,8 @@ def measure(case: Case, count: int) -> dict[str, Any]:
     compile_seconds: dict[str, float] = {}
     errors: dict[str, float] = {}
     truths = np.array([oracle(Placed(case.pair, scene, index), 1e-9)[0] for index in range(CHECKED)])
-    arguments = to_engine(jax.tree.map(lambda rows: rows[:1] if _is_shape(rows, scene) else rows, scene), np.float32)
+    shared = {side: {name: rows[:1] for name, rows in scene[side].items()} for side in "ab"}
+    arguments = to_engine({**scene, **shared}, np.float32)
     for label, function in functions(case).items():
         started = time.process_time()
         compiled = jax.jit(function).lower(*arguments).compile()
@@ -128,14 +138,12 @@ def measure(case: Case, count: int) -> dict[str, Any]:
 def poses(case: Case, count: int) -> dict[str, Any]:
     """A scene of `convex_oracle`: one shape of each kind, random directions and turns."""
     rng = np.random.default_rng(0)
-    points = rng.normal(size=(case.corners, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
     shapes = {
         "sphere": {"radius": 0.5},
         "capsule": {"radius": 0.2, "half_height": 0.5},
         "box": {"half_extents": (0.5, 0.6, 0.4)},
         "cylinder": {"radius": 0.5, "half_height": 0.6},
-        "polyhedron": {"vertices": points},
+        "polyhedron": {"vertices": POINTS[case.corners]},
     }
     offsets = rng.normal(size=(count, 3))
     offsets *= case.distance / np.linalg.norm(offsets, axis=1, keepdims=True)
@@ -144,10 +152,6 @@ def poses(case: Case, count: int) -> dict[str, Any]:
         scene[side] = {n: np.repeat(np.asarray(v, float)[None], count, axis=0) for n, v in shapes[kind].items()}
         scene["q" + side] = Rotation.random(count, random_state=rng).as_quat()[:, [3, 0, 1, 2]]  # pyright: ignore[reportCallIssue]
     return scene
-
-
-def _is_shape(rows: np.ndarray, scene: dict[str, Any]) -> bool:
-    return any(rows is value for side in "ab" for value in scene[side].values())
 
 
 def functions(case: Case) -> dict[str, Callable]:
@@ -179,16 +183,7 @@ def functions(case: Case) -> dict[str, Callable]:
 def _with_faces(shape: dict[str, Any]) -> dict[str, Any]:
     if "vertices" not in shape:
         return shape
-    corners = POINTS[shape["vertices"].x.shape[0]]
-    return {**shape, "faces": hull(corners)[1][None]}
-
-
-def _unit_points(count: int) -> np.ndarray:
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-POINTS = {count: _unit_points(count) for count in (16, 64)}
+    return {**shape, "faces": hull(POINTS[shape["vertices"].x.shape[0]])[1][None]}
 
 
 def _block(compiled: Callable, arguments: Any, count: int) -> Callable[[], int]:
@@ -205,7 +200,7 @@ def table(cases: dict[str, Any], count: int) -> str:
         "# Speed of the narrow phase",
         "",
         f"Written by `python -m tests.benchmarks.pair_speed --count {count}`: {count} pairs in float32 (Coal: float64, called",
-        "from a Python loop, which is part of its time), one thread, process CPU time, contestants in turns, medians. All",
+        "from a Python loop), one thread, process CPU time, contestants in turns, medians. All",
         "see the same poses; shapes are about 1 m in radius. Signed distance: with normal and points, the least of the",
         f"manifold for closed forms. Error: the largest of {CHECKED} separations [m] against cutting planes in float64.",
         "",
