@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mathota_jax.collision.convex import convex_distance
-from mathota_jax.collision.pairs import ITERATIVE, PAIRS
+from mathota_jax.collision.pairs import PAIRS, SEARCHED
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import to_matrix
 from tests.benchmarks import pair_peers
@@ -121,7 +121,6 @@ def measure(case: Case, count: int) -> dict[str, Any]:
     interleave(contestants, QUICK)
     pairs = [(ours, peer) for ours in (VALUE, MANIFOLD) for peer in ("Coal", "MJX")] + [(GRADIENT, VALUE)]
     return {
-        "method": PAIRS[case.pair].method,
         "overlapping": float((truths < 0).mean()),
         "rates": {label: summary(contestant.cpu_rates) for label, contestant in contestants.items()},
         "compile_cpu_seconds": compile_seconds,
@@ -166,7 +165,7 @@ def functions(case: Case) -> dict[str, Callable]:
         return PAIRS[case.pair].function(*placed(*arguments))
 
     def value(*arguments: Any) -> Any:
-        if PAIRS[case.pair].method == ITERATIVE:
+        if PAIRS[case.pair].method in SEARCHED:
             a, pose_a, b, pose_b = placed(*arguments)
             found = convex_distance(kind_a, a, pose_a, kind_b, b, pose_b)
             return found.separation, found.normal, found.point_a
@@ -199,10 +198,10 @@ def table(cases: dict[str, Any], count: int) -> str:
     lines = [
         "# Speed of the narrow phase",
         "",
-        f"Written by `python -m tests.benchmarks.pair_speed --count {count}`: {count} pairs in float32 (Coal: float64, called",
-        "from a Python loop), one thread, process CPU time, contestants in turns, medians. All",
-        "see the same poses; shapes are about 1 m in radius. Signed distance: with normal and points, the least of the",
-        f"manifold for closed forms. Error: the largest of {CHECKED} separations [m] against cutting planes in float64.",
+        f"Written by `python -m tests.benchmarks.pair_speed --count {count}`: {count} pairs in float32 (Coal: float64, from",
+        "a Python loop), one thread, process CPU time, contestants in turns, medians. All see the same poses; shapes are",
+        "about 1 m in radius. Signed distance: with normal and points, the least of the manifold for closed forms. Error:",
+        f"the largest of {CHECKED} separations [m] against cutting planes in float64.",
         "",
         "| case | method | overlapping | contestant | pairs per CPU-s | error | compile CPU-s |",
         "|---|---|---|---|---|---|---|",
@@ -212,7 +211,7 @@ def table(cases: dict[str, Any], count: int) -> str:
             seconds, error = case["compile_cpu_seconds"].get(label), case["errors"].get(label)
             cells = [
                 name,
-                case["method"],
+                PAIRS[CASES[name].pair].method,
                 f"{case['overlapping']:.0%}",
                 label,
                 f"{rate['median']:.3g}",

@@ -61,7 +61,7 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
 
 
 def _best_of_some(wanted: Array, placed: _Placed) -> Axis:
-    """`_best` of the pairs that are wanted, some at a time; zero elsewhere."""
+    """`_best` of the pairs that are wanted, some at a time."""
     lanes, total = wanted.shape, wanted.size
     flat = jax.tree.map(lambda x: _flatten(x, lanes), placed)
     order = jnp.argsort(~wanted.reshape(-1), stable=True)
