@@ -89,7 +89,7 @@ def edge_table(faces: np.ndarray) -> np.ndarray:
             for ends in zip(polygon, polygon[1:] + polygon[:1], strict=True):
                 if ends[0] != ends[1]:
                     face_of.setdefault(ends, face)
-        lists.append(sorted((*ends, f, face_of[ends[::-1]]) for ends, f in face_of.items() if ends[0] < ends[1]))
+        lists.append(sorted((*ends, f, face_of[ends[1], ends[0]]) for ends, f in face_of.items() if ends[0] < ends[1]))
     count = max(len(edges) for edges in lists)
     padded = [edges + edges[:1] * (count - len(edges)) for edges in lists]
     return np.moveaxis(np.asarray(padded, np.int32), -1, 0).swapaxes(1, 2)

@@ -63,10 +63,8 @@ def convex_distance(
     tolerance = PROVED[str(shapes.position.x.dtype)][0 if are_polytopes((kind_a, kind_b)) else 1]
     frozen: Difference = compute_once(lax.stop_gradient(shapes), shapes.position.x)
     if are_polytopes((kind_a, kind_b)):
-        cores = (
-            polytope(kind, core) for kind, core in ((kind_a, frozen.a | _faces(a)), (kind_b, frozen.b | _faces(b)))
-        )
-        searched, upper = search_polytopes(frozen, *cores, tolerance)
+        core_a, core_b = polytope(kind_a, frozen.a | _faces(a)), polytope(kind_b, frozen.b | _faces(b))
+        searched, upper = search_polytopes(frozen, core_a, core_b, tolerance)
     else:
         searched, upper = search_curved(frozen, tolerance)
     closest = polish(shapes, searched)
