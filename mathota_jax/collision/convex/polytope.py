@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -39,6 +40,11 @@ class Edges(NamedTuple):
     along: Vec3
     left: Vec3
     right: Vec3
+
+
+def row_count(edges: Edges) -> int:
+    """How many edges there are; components that all edges share have one row."""
+    return max(component.shape[0] for component in jax.tree.leaves(edges))
 
 
 class Polytope(NamedTuple):

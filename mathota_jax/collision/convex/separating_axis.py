@@ -17,12 +17,12 @@ from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.difference import Difference
-from mathota_jax.collision.convex.polytope import Edges, Polytope
+from mathota_jax.collision.convex.polytope import Edges, Polytope, row_count
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, where
 
-LANES = 256
-"""Pairs that are tested at a time: their edges fit into the cache of a core."""
+EDGES = 256 * 42
+"""Edges of B in all pairs that are tested at a time: they fit into the cache of a core (42: of 16 corners)."""
 ARC_ROUNDING = 8.0
 """Arcs must cross by this many round-offs. A crossing within less of an end is no deeper than the face there, to the same
 round-off of the size, while its direction may be noise."""
@@ -56,28 +56,28 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
     """
     placed = _Placed(a, b, shapes.rotation, shapes.position)
     none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
-    test = _best if wanted.size <= LANES else functools.partial(_best_of_some, wanted)
+    lanes = EDGES // (1 if b.edges is None else row_count(b.edges))
+    test = _best if wanted.size <= lanes else functools.partial(_best_of_some, wanted, lanes)
     return lax.cond(jnp.any(wanted), test, lambda _: none, placed)
 
 
-def _best_of_some(wanted: Array, placed: _Placed) -> Axis:
-    """`_best` of the pairs that are wanted, some at a time."""
-    lanes, total = wanted.shape, wanted.size
-    flat = jax.tree.map(lambda x: _flatten(x, lanes), placed)
+def _best_of_some(wanted: Array, lanes: int, placed: _Placed) -> Axis:
+    """`_best` of the pairs that are wanted, `lanes` at a time."""
+    flat = jax.tree.map(lambda x: _flatten(x, wanted.shape), placed)
     order = jnp.argsort(~wanted.reshape(-1), stable=True)
     count = jnp.sum(wanted, dtype=jnp.int32)
 
     def test_some(state: tuple[Array, Axis]) -> tuple[Array, Axis]:
         turn, found = state
-        chosen = lax.dynamic_slice_in_dim(order, turn * LANES, LANES)
+        chosen = lax.dynamic_slice_in_dim(order, turn * lanes, lanes)
         some = jax.tree.map(lambda x: x if x.shape[-1] == 1 else jnp.take(x, chosen, axis=-1), flat)
         axis = _best(some)
         return turn + 1, jax.tree.map(lambda all_, new: all_.at[0, chosen].set(new[0]), found, axis)
 
-    zero = jnp.zeros((1, total), placed.position.x.dtype)
+    zero = jnp.zeros((1, wanted.size), placed.position.x.dtype)
     state = jnp.zeros((), jnp.int32), Axis(Vec3(zero, zero, zero), zero)
-    _, found = lax.while_loop(lambda s: s[0] * LANES < count, test_some, state)
-    return jax.tree.map(lambda x: x.reshape(lanes), found)
+    _, found = lax.while_loop(lambda s: s[0] * lanes < count, test_some, state)
+    return jax.tree.map(lambda x: x.reshape(wanted.shape), found)
 
 
 def _flatten(values: Array, lanes: tuple[int, ...]) -> Array:
@@ -123,13 +123,13 @@ def _best_crossing(a: Edges, b: Edges) -> Axis:
     def of_edge(_: None, edge: Edges) -> tuple[None, Array]:
         return None, jnp.max(_crossing(edge, b)[1], axis=0)
 
-    count = max(component.shape[0] for component in jax.tree.leaves(a))
+    count = row_count(a)
     rows = jax.tree.map(lambda c: jnp.broadcast_to(c, (count, *c.shape[1:])), a)
     _, scores = lax.scan(of_edge, None, rows)
     _, chosen = best_candidate(scores)
     edge_a = compute_once(pick(rows, chosen), scores)
     score, chosen = best_candidate(_crossing(edge_a, b)[1])
-    count = max(component.shape[0] for component in jax.tree.leaves(b))
+    count = row_count(b)
     edge_b = pick(jax.tree.map(lambda c: jnp.broadcast_to(c, (count, *c.shape[1:])), b), chosen)
     across, _ = _crossing(edge_a, edge_b)
     squared = dot(across, across)
