@@ -226,8 +226,13 @@ def oracle(placed, tolerance=1e-10):
         if normal @ point >= gap - tolerance:
             return placed.reach(normal), normal
         points.append(point)
-    if {kind for kind, *_ in placed.sides} <= set(ROUND):  # the cores, points or segments, meet: all normals across
-        normal = np.linalg.svd(np.array(points))[2][-1]
+    if {kind for kind, *_ in placed.sides} <= set(ROUND):  # the cores, points or segments, meet or all but meet
+        middle = np.mean(points, axis=0)
+        axes = np.linalg.svd(np.array(points) - middle)[2]
+        aside = middle - axes[0] * (axes[0] @ middle)  # from a segment; across a parallelogram it is the last axis
+        aside = aside / max(np.linalg.norm(aside), 1e-300)
+        candidates = [axes[-1], -axes[-1], *([aside] if aside.any() else [])]
+        normal = max(candidates, key=placed.reach)
         return placed.reach(normal), normal
     hull = ConvexHull(np.array(points), incremental=True)
     for _ in range(400):
