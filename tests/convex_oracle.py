@@ -17,11 +17,15 @@ from mathota_jax.collision.convex import convex_distance
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
+from tests.hulls import BOX_CORNERS, hull
 
 KINDS = ("sphere", "capsule", "box", "cylinder", "cone", "polyhedron")
 ROUND, FLAT = ("sphere", "capsule"), ("box", "polyhedron")
 PAIRS = list(itertools.combinations_with_replacement(KINDS, 2))
 VERTICES = 12
+CORNERS = np.random.default_rng(5).normal(size=(VERTICES, 3))
+CORNERS /= np.linalg.norm(CORNERS, axis=1, keepdims=True)
+CORNER_FACES, CUBE_FACES = hull(CORNERS)[1], hull(BOX_CORNERS)[1]
 
 
 # ---- scenes: natural arrays in NumPy, one pose a row -------------------------------------------------------------
@@ -31,10 +35,9 @@ def random_shape(kind, rng, count):
     if kind == "box":
         return {"half_extents": rng.uniform(0.2, 1.0, (count, 3))}
     if kind == "polyhedron":
-        points = rng.normal(size=(count, VERTICES, 3))
-        return {
-            "vertices": points / np.linalg.norm(points, axis=2, keepdims=True) * rng.uniform(0.3, 1.0, (count, 1, 3))
-        }
+        # Linear maps of one hull: all poses have the same faces, as all worlds of a scene do.
+        maps = Rotation.random(count, random_state=rng).as_matrix() * rng.uniform(0.3, 1.0, (count, 1, 3))
+        return {"vertices": CORNERS @ (maps @ Rotation.random(count, random_state=rng).as_matrix()).swapaxes(1, 2)}
     names = ("radius",) if kind == "sphere" else ("radius", "half_height")
     return {name: rng.uniform(0.2, 1.0, count) for name in names}
 
@@ -98,7 +101,14 @@ def to_engine(scene, dtype):
 
 def call(pair, a, pa, qa, b, pb, qb):
     pose_a, pose_b = Pose(pa, to_matrix(normalize(qa))), Pose(pb, to_matrix(normalize(qb)))
-    return convex_distance(pair[0], a, pose_a, pair[1], b, pose_b)
+    return convex_distance(pair[0], with_faces(a), pose_a, pair[1], with_faces(b), pose_b)
+
+
+def with_faces(shape):
+    """The parameters as pair functions take them: polyhedra are `CORNERS`, mapped, or cubes whose first corner repeats."""
+    if "vertices" not in shape:
+        return shape
+    return {**shape, "faces": (CORNER_FACES if shape["vertices"].x.shape[0] == VERTICES else CUBE_FACES)[None]}
 
 
 _compiled = {}
@@ -216,8 +226,13 @@ def oracle(placed, tolerance=1e-10):
         if normal @ point >= gap - tolerance:
             return placed.reach(normal), normal
         points.append(point)
-    if {kind for kind, *_ in placed.sides} <= set(ROUND):  # the cores, points or segments, meet: all normals across
-        normal = np.linalg.svd(np.array(points))[2][-1]
+    if {kind for kind, *_ in placed.sides} <= set(ROUND):  # the cores, points or segments, meet or all but meet
+        middle = np.mean(points, axis=0)
+        axes = np.linalg.svd(np.array(points) - middle)[2]
+        aside = middle - axes[0] * (axes[0] @ middle)  # from a segment; across a parallelogram it is the last axis
+        aside = aside / max(np.linalg.norm(aside), 1e-300)
+        candidates = [axes[-1], -axes[-1], *([aside] if aside.any() else [])]
+        normal = max(candidates, key=placed.reach)
         return placed.reach(normal), normal
     hull = ConvexHull(np.array(points), incremental=True)
     for _ in range(400):

@@ -71,10 +71,25 @@ def polyhedron_edges(faces: np.ndarray) -> np.ndarray:
     Args:
         faces: int32 (pair, face, corner).
     """
+    return edge_table(faces)[:2]
+
+
+def edge_table(faces: np.ndarray) -> np.ndarray:
+    """All edges: vertex numbers of start and end, numbers of the faces to the left and right; int32 (4, edge, pair).
+
+    Seen from outside, the edge runs counter-clockwise about the face to its left. Padded as `polyhedron_edges`.
+
+    Args:
+        faces: int32 (pair, face, corner) of closed polyhedra.
+    """
     lists = []
-    for polygon in faces:
-        ends = np.stack([polygon, np.roll(polygon, -1, axis=1)], -1).reshape(-1, 2)
-        lists.append(np.unique(np.sort(ends[ends[:, 0] != ends[:, 1]], axis=1), axis=0))
+    for polygons in faces:
+        face_of: dict[tuple[int, int], int] = {}
+        for face, polygon in enumerate(polygons.tolist()):
+            for ends in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+                if ends[0] != ends[1]:
+                    face_of.setdefault(ends, face)
+        lists.append(sorted((*ends, f, face_of[ends[1], ends[0]]) for ends, f in face_of.items() if ends[0] < ends[1]))
     count = max(len(edges) for edges in lists)
-    padded = [np.concatenate([edges, np.repeat(edges[:1], count - len(edges), axis=0)]) for edges in lists]
-    return np.stack(padded, axis=-1).swapaxes(0, 1).astype(np.int32)
+    padded = [edges + edges[:1] * (count - len(edges)) for edges in lists]
+    return np.moveaxis(np.asarray(padded, np.int32), -1, 0).swapaxes(1, 2)

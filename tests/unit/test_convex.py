@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mathota_jax import Box, Polyhedron, signed_distance
 from mathota_jax.collision.convex import SUPPORT, support
+from mathota_jax.collision.convex.support import UNROLLED_VERTICES
 from tests.benchmarks.pose_sweep import gate as error_gate
 from tests.benchmarks.pose_sweep import measure, sweep
 from tests.convex_oracle import (
@@ -140,6 +142,19 @@ def test_support_points_are_extreme(kind):
             expected = extreme_point(kind, {name: value[index] for name, value in shape.items()}, directions[index])
             np.testing.assert_allclose([np.broadcast_to(c, (1, 200))[0, index] for c in point], expected, atol=1e-12)
     assert set(SUPPORT) == set(KINDS)
+
+
+def test_polyhedron_of_more_corners_than_are_unrolled(precision):
+    """A hull above a plate: its lowest corner counts."""
+    points = np.random.default_rng(4).normal(size=(UNROLLED_VERTICES + 12, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    hull, plate = Polyhedron(points), Box((5.0, 1.0, 5.0))
+    assert len(hull.vertices) == len(points)
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    for height in (1.5, 1.9, 2.1):
+        found = signed_distance(plate, (np.zeros(3), level), hull, (np.array([0.0, height, 0.0]), level))
+        assert float(found.separation) == pytest.approx(height - 1 + points[:, 1].min(), abs=2e-6)
+        np.testing.assert_allclose(found.normal, (0, 1, 0), atol=1e-6)
 
 
 # ---- degenerate poses --------------------------------------------------------------------------------------------

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import Difference, barycentric, combine, unit
-from mathota_jax.spatial.settle import settle_code
-from mathota_jax.spatial.vector import Vec3, cross, dot, where
+from mathota_jax.spatial.settle import compute_once, settle_code
+from mathota_jax.spatial.vector import Vec3, cross, dot, norm, where
 
 OVERLAP_ROUNDING = 64.0
 """Distances below this many round-offs of the size count as overlap: their direction is noise."""
@@ -35,6 +35,7 @@ class Simplex(NamedTuple):
         pieces: Three int32 piece pairs; unused slots repeat the first.
         point_a: The closest point of A, in the frame of A.
         point_b: The closest point of B (before the shift), in the frame of A.
+        distance: Length of the vector between the closest points (after the shift).
         overlap: bool, the shapes touch or overlap.
     """
 
@@ -42,6 +43,7 @@ class Simplex(NamedTuple):
     pieces: tuple[Array, ...]
     point_a: Vec3
     point_b: Vec3
+    distance: Array
     overlap: Array
 
 
@@ -72,7 +74,7 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
 
     def advance(state: _State) -> _State:
         pieces = shapes.pieces(state.closest)
-        point_a, point_b = shapes.points(pieces, state.closest)
+        point_a, point_b = compute_once(shapes.points(pieces, state.closest), start.x)
         point = point_b - point_a + shift
         # Lanes whose new point does not come closer along the direction have converged.
         gain = state.squared - dot(state.closest, point)
@@ -118,7 +120,7 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
     weights = barycentric(state.points, two, three)
     point_a = combine(weights, state.points_a)
     point_b = point_a + combine(weights, state.points) - shift
-    return Simplex(unit(state.closest, first), pieces, point_a, point_b, state.overlap)
+    return Simplex(unit(state.closest, first), pieces, point_a, point_b, norm(state.closest), state.overlap)
 
 
 def _choose(state: _State, point: Vec3, stop: Array) -> Array:

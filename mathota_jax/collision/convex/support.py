@@ -151,6 +151,7 @@ def _polyhedron_point(shape: Parameters, code: Array, direction: Vec3) -> Vec3:
 
     def selected(component: Array) -> Array:
         if count > UNROLLED_VERTICES:
+            component = component.reshape(count, *(1,) * (code.ndim + 1 - component.ndim), *component.shape[1:])
             full = jnp.broadcast_to(component, (count, *jnp.broadcast_shapes(component.shape[1:], code.shape)))
             return jnp.take_along_axis(full, jnp.broadcast_to(code, full.shape[1:])[None], axis=0)[0]
         value = jnp.broadcast_to(component[0], jnp.broadcast_shapes(component.shape[1:], code.shape))

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple, Protocol
 
+from mathota_jax.collision.convex.polytope import are_polytopes
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.collision.pairs.box_box import box_box
 from mathota_jax.collision.pairs.capsule_box import capsule_box
@@ -37,7 +38,10 @@ CONVEX = ("capsule", "box", "cylinder", "cone", "polyhedron")
 
 CLOSED_FORM = "closed form"
 SEPARATING_AXES = "separating axes, clipping"
-ITERATIVE = "GJK, EPA, clipping"
+SEARCHED_AXES = "GJK or separating axes, clipping"
+SEARCHED_CURVED = "GJK, EPA, clipping"
+SEARCHED = (SEARCHED_AXES, SEARCHED_CURVED)
+"""Methods that begin with a distance search."""
 LOCAL_CELLS = "faces, ridges and peaks of the cells under the body"
 
 
@@ -50,7 +54,8 @@ class Pair(NamedTuple):
 
 
 def _convex(kind_a: str, kind_b: str) -> Pair:
-    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), ITERATIVE)
+    method = SEARCHED_AXES if are_polytopes((kind_a, kind_b)) else SEARCHED_CURVED
+    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), method)
 
 
 PAIRS: dict[tuple[str, str], Pair] = {
