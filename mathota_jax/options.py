@@ -47,6 +47,8 @@ class Options:
     warm_start: bool = True
     broadphase: str = "auto"
     pair_capacity: int | None = None
+    solver: str = "pgs"
+    substeps: int | None = None
     gradient_iterations: int | None = None
 
     def __post_init__(self) -> None:

@@ -28,7 +28,7 @@ from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
+from mathota_jax.solver import pgs, soft_step
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once, materialize
@@ -105,6 +105,7 @@ class _Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word."""
 
     joints: joint.JointRows | None
+    middle: joint.JointRows | None
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
@@ -127,11 +128,15 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = _constrain(model, state, bodies, blocks, inertia, free)
     start = _warm_start(model, state, problem)
-    solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
-    lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
+    if scene.options.solver == "soft_step":
+        solved, lever_sum, impulses = _soft_step(model, problem, blocks, free, start)
+    else:
+        solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
+        lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
     moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
     moved, displacement = compute_once((moved, displacement), state.position)
-    moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
+    if scene.options.solver == "pgs":
+        moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
     return _finish(scene, state, moved, _forces(model, problem, impulses))
 
 
@@ -174,7 +179,7 @@ def _constrain(
 ) -> _Problem:
     """Phases 2, 3 and 5: narrow phase and rows."""
     scene = model.scene
-    joints, joint_rows = None, ()
+    joints, middle, joint_rows = None, None, ()
     if scene.joints:
         joints = joint.joint_rows(model, bodies)
         middle = joint.joint_rows(model, joint.midpoint(bodies, model.dt))
@@ -207,7 +212,7 @@ def _constrain(
             for group in (close.groups if close else ())
             for table, pairs in group.tables
         ]
-    return _Problem(joints, joint_rows, contacts, contact_rows, close)
+    return _Problem(joints, middle, joint_rows, contacts, contact_rows, close)
 
 
 def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, ...]:
@@ -239,6 +244,22 @@ def _solve(
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
     iterations = scene.options.velocity_iterations
     return pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start)
+
+
+def _soft_step(
+    model: Model, problem: _Problem, blocks: Bodies, free: tuple[Vec3, Vec3], start: tuple[Array, ...]
+) -> tuple[Array, Array, tuple[Array, ...]]:
+    """Phases 5 to 7 in small steps: velocities, displacement by the impulses, and the impulses of the step."""
+    scene, rows = model.scene, problem.rows
+    substeps = scene.options.substeps or 4
+    begin, end = _pack(scene, blocks.velocity, blocks.angular_velocity), _pack(scene, *free)
+    worlds = max([begin.shape[-1], end.shape[-1], *(group.bias.shape[-1] for group in rows)])
+    begin, end = (jnp.broadcast_to(v, (*v.shape[:-1], worlds)) for v in (begin, end))
+    errors = tuple(joint.position_error(scene, group.table, model, problem.joints, problem.middle, worlds) for group in problem.joint_rows)
+    errors += tuple(contact.position_error(scene, group, model, worlds) for group in problem.contact_rows)
+    solved, displacement, impulses = soft_step.solve(
+        substeps, rows, errors, begin, end, tuple(i / substeps for i in start), model.dt)
+    return solved, displacement - (begin + end) * (0.5 * model.dt), impulses
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:

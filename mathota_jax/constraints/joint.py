@@ -17,6 +17,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.soft_step import PositionError
 from mathota_jax.solver.table import Constraint, Table, make_tables
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import exponential, multiply
@@ -174,6 +175,16 @@ def velocity_rows(
         upper=_bounds(table, np.full(one_sided.shape, np.inf)),
     )
     return _pack(table, jacobians, responses, bias, law, worlds)
+
+
+def position_error(scene: Scene, table: Table, model: Model, joints: JointRows, middle: JointRows, worlds: int) -> PositionError:
+    """Errors for the small steps."""
+    error, _, one_sided, damped = _chosen(table, joints)
+    curvature = jnp.where(one_sided | damped, 0.0, select(table, middle.rate - joints.rate))
+    limit = jnp.where(damped, 0.0, jnp.full(error.shape, jnp.inf))
+    packed = [pack_scalars(table, [value], worlds) for value in (error, limit, curvature)]
+    sided = jnp.asarray(one_sided).reshape(table.turn_count, 1, len(table.slots[0]), 1)
+    return PositionError(packed[0], packed[1], sided, packed[2])
 
 
 def _end_weight(decay: Array) -> Array:

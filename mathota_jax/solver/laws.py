@@ -56,9 +56,14 @@ class Cone:
     def update(self, impulse: Array, error: Array) -> Array:
         """Normal row first, then the tangents with the normal's new impulse."""
         row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
-        old_n, old_1, old_2 = unstack(impulse, row)
-        error_n, error_1, error_2 = unstack(error, row)
-        normal = jnp.maximum(old_n - error_n * self.normal_mass, 0.0)
+        normal = jnp.maximum(unstack(impulse, row)[0] - unstack(error, row)[0] * self.normal_mass, 0.0)
+        return self.with_friction(normal, impulse, error)
+
+    def with_friction(self, normal: Array, impulse: Array, error: Array) -> Array:
+        """All three rows for a given new impulse of the normal row."""
+        row = impulse.ndim - 3
+        _, old_1, old_2 = unstack(impulse, row)
+        _, error_1, error_2 = unstack(error, row)
         free_1 = old_1 - error_1 * self.tangent_mass
         free_2 = old_2 - error_2 * self.tangent_mass
         squared = free_1 * free_1 + free_2 * free_2

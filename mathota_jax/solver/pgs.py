@@ -92,12 +92,12 @@ def solve(
         return velocity, impulses
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law for group in rows)
-    return _iterate(
+    return sweeps(
         iterations, rows, lambda law, impulse, error: law.update(impulse, error), laws, biases, velocity, impulses
     )
 
 
-def _iterate(
+def sweeps(
     iterations: int,
     rows: tuple[Rows, ...],
     update: Update,
@@ -106,6 +106,8 @@ def _iterate(
     velocity: Array,
     impulses: tuple[Array, ...],
 ) -> tuple[Array, tuple[Array, ...]]:
+    """Plain sweeps, whose derivative is that of every update; `update` gets the coefficients of a group at each turn."""
+
     def sweep(_: int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         velocity, old = carry
         new = []
@@ -319,7 +321,7 @@ def _solve_linear(
 
 def _linear_sweeps(iterations: int, rows: tuple[Rows, ...], coefficients: tuple[object, ...]) -> tuple[Array, ...]:
     zeros = tuple(jnp.zeros_like(group.bias) for group in rows)
-    return _iterate(iterations, rows, _linear_update, coefficients, zeros, _no_velocity(rows), zeros)[1]
+    return sweeps(iterations, rows, _linear_update, coefficients, zeros, _no_velocity(rows), zeros)[1]
 
 
 def _no_velocity(rows: tuple[Rows, ...]) -> Array:
