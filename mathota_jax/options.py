@@ -8,7 +8,11 @@ from typing import Any
 
 BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
 
-OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1))
+SOLVER_CHOICES = ("pgs", "soft_step")
+
+DEFAULT_SUBSTEPS = 4
+
+OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1), ("substeps", 1))
 """Integers that may be None, and their least value."""
 
 
@@ -34,6 +38,12 @@ class Options:
         "sort_and_sweep", "grid", "bvh". Guide 5.4.
       pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
+      solver: "pgs": projected Gauss-Seidel with position correction. "soft_step": one collision pass and several substeps
+        of two sweeps each, which also take out position errors and are differentiated as they are. Of the settings above,
+        `position_iterations`, `slop`, `position_percent`, `baumgarte` and `gradient_iterations` do not concern it, and
+        `velocity_iterations` is the number of sweeps of its restitution pass. Guide 11.3 (fixed time step) and
+        `solver.soft_step`.
+      substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square.
     """
 
     dt: float = 1 / 60
@@ -47,9 +57,9 @@ class Options:
     warm_start: bool = True
     broadphase: str = "auto"
     pair_capacity: int | None = None
+    gradient_iterations: int | None = None
     solver: str = "pgs"
     substeps: int | None = None
-    gradient_iterations: int | None = None
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and self.dt > 0):
@@ -72,6 +82,19 @@ class Options:
         if self.broadphase not in BROADPHASE_CHOICES:
             known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
             raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")
+        if self.solver not in SOLVER_CHOICES:
+            known = ", ".join(repr(choice) for choice in SOLVER_CHOICES)
+            raise ValueError(f"Options.solver must be one of {known}, got {self.solver!r}")
+        if self.substeps is not None and self.solver != "soft_step":
+            raise ValueError(
+                f"Options.substeps = {self.substeps} needs solver='soft_step', got solver={self.solver!r}; "
+                "for smaller steps of this solver divide dt instead"
+            )
+
+    @property
+    def substep_count(self) -> int:
+        """Substeps of a step of the small-steps tier."""
+        return DEFAULT_SUBSTEPS if self.substeps is None else self.substeps
 
 
 def _is_number(value: Any) -> bool:

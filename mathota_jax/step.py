@@ -129,7 +129,7 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     problem = _constrain(model, state, bodies, blocks, inertia, free)
     start = _warm_start(model, state, problem)
     if scene.options.solver == "soft_step":
-        solved, lever_sum, impulses = _soft_step(model, problem, blocks, free, start)
+        solved, lever_sum, impulses = _small_steps(model, problem, blocks, free, start)
     else:
         solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
         lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
@@ -183,8 +183,11 @@ def _constrain(
     if scene.joints:
         joints = joint.joint_rows(model, bodies)
         middle = joint.joint_rows(model, joint.midpoint(bodies, model.dt))
+        # Damping acts over the time between two sweeps.
+        small = scene.options.solver == "soft_step"
+        row_model = dataclasses.replace(model, dt=model.dt / scene.options.substep_count) if small else model
         joint_rows = tuple(
-            joint.velocity_rows(scene, table, model, joints, middle, inertia) for table in joint.joint_tables(scene)
+            joint.velocity_rows(scene, table, row_model, joints, middle, inertia) for table in joint.joint_tables(scene)
         )
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
@@ -246,20 +249,24 @@ def _solve(
     return pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start)
 
 
-def _soft_step(
+def _small_steps(
     model: Model, problem: _Problem, blocks: Bodies, free: tuple[Vec3, Vec3], start: tuple[Array, ...]
 ) -> tuple[Array, Array, tuple[Array, ...]]:
-    """Phases 5 to 7 in small steps: velocities, displacement by the impulses, and the impulses of the step."""
-    scene, rows = model.scene, problem.rows
-    substeps = scene.options.substeps or 4
+    """Phases 5 to 7 in small steps: velocities, displacements by the impulses, and the impulses of the whole step."""
+    scene, options, rows = model.scene, model.scene.options, problem.rows
     begin, end = _pack(scene, blocks.velocity, blocks.angular_velocity), _pack(scene, *free)
     worlds = max([begin.shape[-1], end.shape[-1], *(group.bias.shape[-1] for group in rows)])
-    begin, end = (jnp.broadcast_to(v, (*v.shape[:-1], worlds)) for v in (begin, end))
-    errors = tuple(joint.position_error(scene, group.table, model, problem.joints, problem.middle, worlds) for group in problem.joint_rows)
-    errors += tuple(contact.position_error(scene, group, model, worlds) for group in problem.contact_rows)
-    solved, displacement, impulses = soft_step.solve(
-        substeps, rows, errors, begin, end, tuple(i / substeps for i in start), model.dt)
-    return solved, displacement - (begin + end) * (0.5 * model.dt), impulses
+    begin, end = (jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds)) for velocity in (begin, end))
+    errors = tuple(contact.position_error(scene, group, model, worlds) for group in problem.contact_rows)
+    if problem.joints is not None and problem.middle is not None:
+        tables = (group.table for group in problem.joint_rows)
+        joints = (joint.position_error(scene, t, model, problem.joints, problem.middle, worlds) for t in tables)
+        errors = (*joints, *errors)
+    count = options.substep_count
+    start = tuple(impulse / count for impulse in start)
+    rebound_sweeps = options.velocity_iterations if scene.restitution else 0
+    added, lever_sum, impulses = soft_step.solve(count, rebound_sweeps, rows, errors, begin, end, start, model.dt)
+    return end + added, lever_sum, impulses
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:

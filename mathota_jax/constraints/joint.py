@@ -10,7 +10,16 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia
-from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sides, respond, select, select_blocks
+from mathota_jax.constraints.assembly import (
+    Side,
+    inner,
+    pack_scalars,
+    pack_sides,
+    push_out_speed,
+    respond,
+    select,
+    select_blocks,
+)
 from mathota_jax.constraints.joints import JOINTS
 from mathota_jax.constraints.joints.frames import JointFrames, JointRow, damping_row, joint_frames, limit_rows
 from mathota_jax.model import Model
@@ -177,14 +186,18 @@ def velocity_rows(
     return _pack(table, jacobians, responses, bias, law, worlds)
 
 
-def position_error(scene: Scene, table: Table, model: Model, joints: JointRows, middle: JointRows, worlds: int) -> PositionError:
-    """Errors for the small steps."""
+def position_error(
+    scene: Scene, table: Table, model: Model, joints: JointRows, middle: JointRows, worlds: int
+) -> PositionError:
+    """What the small steps need to know of the errors of one table; the arguments are those of `velocity_rows`."""
     error, _, one_sided, damped = _chosen(table, joints)
     curvature = jnp.where(one_sided | damped, 0.0, select(table, middle.rate - joints.rate))
-    limit = jnp.where(damped, 0.0, jnp.full(error.shape, jnp.inf))
-    packed = [pack_scalars(table, [value], worlds) for value in (error, limit, curvature)]
-    sided = jnp.asarray(one_sided).reshape(table.turn_count, 1, len(table.slots[0]), 1)
-    return PositionError(packed[0], packed[1], sided, packed[2])
+    limit = jnp.where(damped, 0.0, push_out_speed(scene, table, model))
+    packed_error, packed_limit, packed_curvature = (
+        pack_scalars(table, [value], worlds) for value in (error, limit, curvature)
+    )
+    sided = jnp.asarray(one_sided).reshape(table.turn_count, 1, table.column_count, 1)
+    return PositionError(packed_error, packed_limit, sided, None, packed_curvature)
 
 
 def _end_weight(decay: Array) -> Array:

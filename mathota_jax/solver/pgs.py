@@ -40,11 +40,12 @@ class Places:
     Attributes:
       blocks: for each side, (turn, constraint, world) velocity block; an empty place has block `block_count`, which does
         not exist. No block occurs twice in a turn.
-      turns: () number of turns that hold a constraint in some world; they are the first ones.
+      turns: () number of turns that hold a constraint in some world; they are the first ones. None for all turns: that
+        loop can be differentiated in reverse mode.
     """
 
     blocks: tuple[Array, ...]
-    turns: Array
+    turns: Array | None
 
 
 @pytree
@@ -160,7 +161,8 @@ def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, 
         velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, values)
         return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
 
-    return lax.fori_loop(0, places.turns, body, (velocity, impulse))
+    turns = group.table.turn_count if places.turns is None else places.turns
+    return lax.fori_loop(0, turns, body, (velocity, impulse))
 
 
 def _turn(

@@ -1,0 +1,346 @@
+"""The small-steps tier: stacks, friction, restitution, recovery from overlap, chains, momentum, derivatives."""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Sphere, rollout
+from tests.scenes import (
+    DOWN,
+    GRAVITY,
+    advance,
+    advance_worlds,
+    axis_angle,
+    body_on_plane,
+    box_stack,
+    invariants,
+    motion,
+    per_body,
+    record_worlds,
+    repeat,
+    rotation_matrix,
+    slab_on_plane,
+    sphere_on_plane,
+    tilted_gravity,
+    undamped,
+)
+
+DT = 1 / 60
+
+
+def soft(**changes):
+    return Options(**{"dt": DT, "solver": "soft_step", **changes})
+
+
+def soft_undamped(**changes):
+    return undamped(**{"dt": DT, "solver": "soft_step", **changes})
+
+
+def recorded(model, state, steps, observe=motion):
+    """The record of one world, in NumPy."""
+    final, record = record_worlds(repeat(model, 1), repeat(state, 1), steps, observe)
+    return jax.tree.map(lambda leaf: leaf[0], final), {
+        name: np.asarray(values, dtype=float)[:, 0] for name, values in record.items()
+    }
+
+
+# Stacks (benchmark B3) -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "count", [10, pytest.param(20, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.slow)]
+)
+def test_stack_stands(count, gate):
+    """Cubes of 1 m. The last gates: it comes to rest, and there the load of a contact sinks it as the stiffness says."""
+    half, dt = 0.5, DT
+    model, state = box_stack(count, half=half, options=soft(dt=dt), friction=0.6)
+    final, record = recorded(model, state, 600)
+    moved = record["position"][:, 1:] - np.asarray(state.position, dtype=float)[1:]
+    gate("horizontal drift in 10 s [m]", np.linalg.norm(moved[..., [0, 2]], axis=-1), 0.01)
+    gate("height lost / height", moved[:, -1, 1] / (2 * half * count), 0.005)
+    gate("speed at the end [m/s]", final.velocity[1:], 1e-3)
+    height = np.concatenate([[-half], record["position"][-1, 1:, 1]])
+    overlap = 2 * half - np.diff(height)
+    load = GRAVITY * np.arange(count, 0, -1)
+    inverse_mass = np.where(np.arange(count) == 0, 1.0, 2.0)
+    # F sum(1/m) / (2 omega^2): half the impulse acts before the drift.
+    sink = load * inverse_mass / (2 * (2 * np.pi / 4 * 4 / dt) ** 2)
+    gate("overlap at rest / load over stiffness - 1", overlap / sink - 1, 0.05)
+    assert int(final.flags) == 0
+
+
+def test_ten_small_boxes_at_the_cost_target(precision, gate):
+    """The setting for which the speed of the tier is quoted: 1/240 s in two substeps."""
+    model, state = box_stack(10, options=soft(dt=1 / 240, substeps=2))
+    _, record = recorded(model, state, 720)
+    height = np.concatenate([np.full((720, 1), -0.1), record["position"][:, 1:, 1]], axis=1)
+    gate("overlap at rest [m]", np.maximum(0.2 - np.diff(height, axis=1), 0)[240:], 3e-4)
+    gate("speed at the end [m/s]", record["velocity"][-1, 1:], 1e-4)
+
+
+# Friction (benchmarks A9 and A10) ------------------------------------------------------------------------------------
+
+FRICTIONS, HEADINGS = (0.2, 0.4, 0.7), (0.0, 11.25, 22.5, 33.75, 45.0)
+
+
+def test_sliding_box_stops_where_coulomb_says(precision, gate):
+    grid = list(itertools.product(FRICTIONS, (0.0, 45.0), HEADINGS))
+    friction, yaw, heading = (np.array(column) for column in zip(*grid, strict=True))
+    model, state = slab_on_plane(options=soft_undamped())
+    models = repeat(model, len(grid))
+    models = dataclasses.replace(models, friction=per_body(friction, models.friction))
+    turned = np.stack([axis_angle((0, 1, 0), angle) for angle in np.radians(yaw)])
+    states = repeat(state, len(grid))
+    states = dataclasses.replace(states, orientation=states.orientation.at[:, 1].set(jnp.asarray(turned)))
+    settled = advance_worlds(models, states, 30)
+    direction = np.radians(heading)
+    push = 2.0 * np.stack([np.cos(direction), np.zeros_like(direction), np.sin(direction)], axis=-1)
+    pushed = dataclasses.replace(settled, velocity=settled.velocity.at[:, 1].set(jnp.asarray(push)))
+    stopped = advance_worlds(models, pushed, 72)
+    rested = advance_worlds(models, stopped, 300)
+    path = np.asarray(stopped.position[:, 1] - settled.position[:, 1], dtype=float)
+    distance = np.hypot(path[:, 0], path[:, 2])
+    gate("distance / truth - 1", distance / (2.0**2 / (2 * friction * GRAVITY)) - 1, 0.01)
+    gate("heading error [deg]", np.degrees(np.arctan2(path[:, 2], path[:, 0]) - direction), 0.1)
+    ratio = distance.reshape(-1, len(HEADINGS))
+    gate("isotropy max / min - 1", ratio.max(axis=-1) / ratio.min(axis=-1) - 1, 0.01)
+    gate("creep over 5 s [m]", rested.position[:, 1] - stopped.position[:, 1], 1e-4)
+
+
+def on_slopes(friction, angle):
+    model, state = slab_on_plane(options=soft_undamped())
+    models = repeat(model, len(angle))
+    gravity = jnp.asarray(tilted_gravity(angle), dtype=models.gravity.dtype)
+    models = dataclasses.replace(models, friction=per_body(friction, models.friction), gravity=gravity)
+    final = advance_worlds(models, repeat(state, len(angle)), 180)
+    return np.asarray(final.position[:, 1] - state.position[1], dtype=float)
+
+
+SLOPES = [
+    (friction, angle)
+    for friction, angle in itertools.product((0.1, 0.3, 0.5, 0.7, 1.0), (3.0, 10.0, 20.0, 30.0, 40.0))
+    if abs(angle - np.degrees(np.arctan(friction))) >= 2
+]
+
+
+def test_slab_slides_down_as_coulomb_says(precision, gate):
+    friction, angle = (np.array(column) for column in zip(*SLOPES, strict=True))
+    path, slope = on_slopes(friction, angle), np.radians(angle)
+    slides = np.tan(slope) > friction
+    truth = (0.5 * GRAVITY * (np.sin(slope) - friction * np.cos(slope)) * 3.0**2)[slides]
+    gate("sliding distance / truth - 1", path[slides, 0] / truth - 1, 0.01)
+    gate("sideways / distance", path[slides, 2] / truth, 2e-3)
+    gate("movement of those that stick in 3 s [m]", path[~slides], 1e-3)
+
+
+def test_slab_that_sticks_does_not_creep(precision, gate):
+    friction, angle = (np.array(column) for column in zip(*SLOPES, strict=True))
+    path = on_slopes(friction, angle)
+    gate("creep in 3 s [m]", path[np.tan(np.radians(angle)) < friction][:, ::2], 1e-4)
+
+
+# Restitution (benchmark A12a) ----------------------------------------------------------------------------------------
+
+RESTITUTIONS = (0.0, 0.25, 0.5, 0.75, 0.8, 0.9, 1.0)
+FALL_TIME = np.sqrt(2 / GRAVITY)
+
+
+def test_dropped_sphere(precision, gate):
+    dt = 1 / 240
+    model, state = sphere_on_plane(height=1.0, restitution=0.5, options=soft_undamped(dt=dt))
+    models = repeat(model, len(RESTITUTIONS))
+    models = dataclasses.replace(models, restitution=per_body(RESTITUTIONS, models.restitution))
+    _, record = record_worlds(models, repeat(state, len(RESTITUTIONS)), 1200, motion)
+    height = np.asarray(record["position"], dtype=float)[:, :, 1, 1] - 0.1
+    speed = np.asarray(record["velocity"], dtype=float)[:, :, 1, 1]
+    energy = height + speed**2 / (2 * GRAVITY)  # in units of the drop: the apex of the flight through a sample
+    for world, e in enumerate(RESTITUTIONS):
+        for bounce in (1, 2, 3):
+            rise = FALL_TIME * e**bounce
+            if 2 * rise < 3 * dt:
+                break  # too short a flight to contain a sample for certain
+            middle = FALL_TIME * (1 + 2 * sum(e**earlier for earlier in range(1, bounce))) + rise
+            gate(
+                f"e={e}: apex {bounce} / truth - 1", energy[round(middle / dt) - 1, world] / e ** (2 * bounce) - 1, 0.01
+            )
+        gate(f"e={e}: energy gained / energy", max(0.0, energy[:, world].max() - 1), 5e-4)
+        gate(f"e={e}: overlap with the plane [m]", min(0.0, height[:, world].min()), 1e-3)
+        if e < 0.85:
+            gate(f"e={e}: speed at rest [m/s]", speed[-60:, world], 1e-3)
+    gate("e=1: energy lost in 5 s", max(0.0, 1 - energy[-1, -1]), 1e-3)
+
+
+# Overlap (benchmark B10) ---------------------------------------------------------------------------------------------
+
+PUSH_OUT = 3.0
+"""Largest push-out velocity [m/s] for a cube of 1 m."""
+
+
+def test_overlapping_pyramid_comes_apart_gently(gate):
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.6)
+    for row in range(4):
+        for column in range(4 - row):
+            place = (0.75 * (column + 0.5 * row), 0.5 + 0.75 * row, 0.0)
+            builder.add_body(Box((0.5, 0.5, 0.5)), density=1.0, position=place, friction=0.6)
+    model, state = builder.build(soft())
+    final, record = recorded(model, state, 300)
+    speed = np.linalg.norm(record["velocity"][:, 1:], axis=-1)
+    gate("largest speed [m/s]", speed, 1.5 * PUSH_OUT + np.sqrt(2 * GRAVITY * 3.25))
+    gate("speed at the end [m/s]", speed[-1], 0.05)
+    assert int(final.flags) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spread", [1e-4, 0.0])
+def test_boxes_on_one_point_separate(spread, gate):
+    """Through the broadphase, whose contacts find their places anew in each step."""
+    rng = np.random.default_rng(0)
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    for _ in range(20):
+        builder.add_body(Box((0.5, 0.5, 0.5)), mass=1.0, position=spread * rng.uniform(-1, 1, 3))
+    model, state = builder.build(soft(broadphase="all_pairs"))
+    final, record = recorded(model, state, 300)
+    gate("largest speed [m/s]", np.linalg.norm(record["velocity"], axis=-1), 1.5 * PUSH_OUT)
+    position = np.asarray(final.position, dtype=float)
+    apart = np.linalg.norm(position[:, None] - position[None], axis=-1) + 10 * np.eye(20)
+    assert np.isfinite(position).all()
+    assert apart.min() > 0.9, f"two boxes are still {apart.min():.3g} m apart"
+
+
+# Chains (benchmark B7) -----------------------------------------------------------------------------------------------
+
+
+def chain(links, end_mass=None, spacing=1.0, **options):
+    """Capsules of length 1 hung from a fixed point, lying along X; a heavier ball at the end if `end_mass` is given."""
+    builder = SceneBuilder(gravity=DOWN)
+    parent = builder.add_body(Sphere(0.1), static=True, collides=False)
+    for index in range(links):
+        child = builder.add_body(
+            Capsule(0.125, 0.375), mass=5.98, position=(spacing * (index + 0.5), 0, 0),
+            orientation=axis_angle((0, 0, 1), np.pi / 2), collides=False,
+        )  # fmt: skip
+        builder.add_joint(Hinge(parent=parent, child=child, anchor=(spacing * index, 0, 0), axis=(0, 0, 1)))
+        parent = child
+    if end_mass:
+        ball = builder.add_body(Sphere(8.0), mass=end_mass, position=(links + 8.0, 0, 0), collides=False)
+        builder.add_joint(Hinge(parent=parent, child=ball, anchor=(links, 0, 0), axis=(0, 0, 1)))
+    return builder.build(soft(linear_damping=0.1, angular_damping=0.1, **options))
+
+
+def joint_gaps(record, links):
+    """Distances [m] between the ends of neighbouring links; the axis of a link is its local -Y before the turn."""
+    position = record["position"][:, : links + 1]
+    along = -rotation_matrix(record["orientation"][:, : links + 1])[..., :, 1]
+    ends, starts = position + 0.5 * along, position - 0.5 * along
+    gaps = starts[:, 1:] - ends[:, :-1]
+    gaps[:, 0] = starts[:, 1]
+    return np.linalg.norm(gaps, axis=-1)
+
+
+def test_chain_of_ten_holds(gate):
+    model, state = chain(10)
+    _, record = recorded(model, state, 600)
+    gate("joint gap / link", joint_gaps(record, 10), 0.01)
+
+
+@pytest.mark.slow
+def test_ball_and_chain_holds(gate):
+    model, state = chain(40, end_mass=4021.0)
+    _, record = recorded(model, state, 600)
+    gate("joint gap / link", joint_gaps(record, 40), 0.01)
+
+
+# Momentum and free motion --------------------------------------------------------------------------------------------
+
+
+def test_free_collision_conserves_momentum(precision, gate):
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    builder.add_body(Box((0.2, 0.1, 0.15)), mass=1.0, velocity=(1.0, 0.1, 0), angular_velocity=(1.0, 2.0, -1.0))
+    builder.add_body(Box((0.25, 0.1, 0.1)), mass=3.0, position=(0.7, 0.05, 0.02), velocity=(-1.0, 0, 0.05))
+    model, state = builder.build(soft_undamped(dt=1 / 240))
+    final = advance(model, state, 120)
+    leaves = {"mass": model.mass, "inertia": model.inertia}
+    before, after = (
+        invariants(leaves, s.position, s.orientation, s.velocity, s.angular_velocity) for s in (state, final)
+    )
+    assert after[0] < 0.9 * before[0], "they do not collide"
+    eps = float(np.finfo(precision).eps)
+    gate("linear momentum [kg m/s]", after[1] - before[1], 50 * eps)
+    gate("angular momentum [kg m^2/s]", after[2] - before[2], 0.005)
+
+
+def test_flight_is_exact(precision, gate):
+    """A box in flight above the plane: the parabola, and an angular momentum that stays."""
+    model, state = body_on_plane(
+        Box((0.1, 0.2, 0.3)), position=(0, 50.0, 0), velocity=(1.0, 2.0, 3.0), angular_velocity=(3.0, 0.1, 0.2),
+        options=soft_undamped(),
+    )  # fmt: skip
+    final = advance(model, state, 60)
+    limit = {"float32": 5e-5, "float64": 1e-11}[str(precision)]
+    gate("position [m]", final.position[1] - np.array([1.0, 52.0 - GRAVITY / 2, 3.0]), limit)
+    leaves = {"mass": model.mass[1:], "inertia": model.inertia[1:]}
+    spin = [
+        invariants(leaves, 0 * s.position[1:], s.orientation[1:], s.velocity[1:], s.angular_velocity[1:])[2]
+        for s in (state, final)
+    ]
+    gate("angular momentum", spin[1] - spin[0], limit)
+
+
+# Derivatives ---------------------------------------------------------------------------------------------------------
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def end_of_slide(parameters, model, state, count):
+    model = dataclasses.replace(
+        model,
+        friction=jnp.full_like(model.friction, parameters["friction"]),
+        gravity=jnp.array([0.0, -1.0, 0.0]) * parameters["gravity"],
+    )
+    state = dataclasses.replace(state, velocity=state.velocity.at[1, 0].set(parameters["speed"]))
+    return rollout(model, state, count)[0].position[1, 0]
+
+
+def test_derivatives_of_a_slide_to_rest(precision, gate):
+    model, state = slab_on_plane(options=soft_undamped())
+    values = {"speed": 2.0, "friction": 0.4, "gravity": GRAVITY}
+    values = {name: jnp.asarray(value) for name, value in values.items()}
+    reverse = jax.jit(jax.grad(end_of_slide), static_argnames="count")(values, model, state, count=45)
+    distance = 2.0**2 / (2 * 0.4 * GRAVITY)
+    truth = {"speed": 2.0 / (0.4 * GRAVITY), "friction": -distance / 0.4, "gravity": -distance / GRAVITY}
+    for name, value in truth.items():
+        gate(f"d x / d {name} / truth - 1", float(reverse[name]) / value - 1, 0.01)
+    if precision == "float64":
+        forward = jax.jit(jax.jacfwd(end_of_slide), static_argnames="count")(values, model, state, count=45)
+        for name in truth:
+            gate(f"forward against reverse, {name}", float(forward[name] / reverse[name]) - 1, 1e-9)
+
+
+@pytest.mark.slow
+def test_gradient_through_the_broadphase(float64, gate):
+    """Reverse mode through turns that are known only in the step, against forward mode and a difference quotient."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True)
+    for index in range(4):
+        builder.add_body(
+            Sphere(0.1), mass=1.0, position=(0.19 * index, 0.099, 0.01 * index), velocity=(0.3 - index, 0, 0)
+        )
+    model, state = builder.build(soft_undamped(broadphase="all_pairs"))
+
+    def loss(velocity):
+        final = rollout(model, dataclasses.replace(state, velocity=velocity), 3)[0]
+        return jnp.sum(final.position * jnp.arange(final.position.size).reshape(final.position.shape))
+
+    gradient = jax.jit(jax.grad(loss))(state.velocity)
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=state.velocity.shape)).at[0].set(0)
+    _, forward = jax.jit(lambda d: jax.jvp(loss, (state.velocity,), (d,)))(direction)
+    value = jax.jit(loss)
+    quotient = (value(state.velocity + 1e-6 * direction) - value(state.velocity - 1e-6 * direction)) / 2e-6
+    along = jnp.sum(gradient * direction)
+    gate("reverse / forward - 1", along / forward - 1, 1e-9)
+    gate("reverse / difference quotient - 1", along / quotient - 1, 1e-4)
