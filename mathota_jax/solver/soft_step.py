@@ -104,7 +104,7 @@ class Manifold:
         if self.lasting is not None:
             new = jnp.maximum(old + jnp.where(self.lasting, OVER_RELAXATION, 1.0) * (new - old), 0.0)
         if isinstance(self.base, Cone):
-            return self.base.with_friction(new, impulse, error)
+            return self.base.with_friction(new, (impulse[1], impulse[2]), (error[1], error[2]))
         return new[None]
 
     def _respond(self, change: Array) -> Array:

@@ -18,6 +18,8 @@ DEFAULTS = {
     "warm_start": True,
     "broadphase": "auto",
     "pair_capacity": None,
+    "solver": "pgs",
+    "substeps": None,
 }
 OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}
 
@@ -44,3 +46,22 @@ def test_options_are_frozen_hashable_and_comparable():
 def test_bad_broadphase_is_refused(name, value):
     with pytest.raises(ValueError, match=f"Options.{name}"):
         Options(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"solver": "xpbd"}, "Options.solver must be one of 'pgs', 'soft_step'.*, got 'xpbd'"),
+        ({"solver": "soft_step", "substeps": 0}, "Options.substeps must be an integer of at least 1, got 0"),
+        ({"solver": "soft_step", "substeps": 2.5}, "Options.substeps must be an integer of at least 1, got 2.5"),
+        ({"substeps": 4}, "Options.substeps = 4 needs solver='soft_step', got solver='pgs'; .* divide dt"),
+    ],
+)
+def test_bad_solver_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Options(**arguments)
+
+
+def test_substeps_have_a_default_where_they_mean_something():
+    assert Options(solver="soft_step").substep_count == 4
+    assert Options(solver="soft_step", substeps=7).substep_count == 7
