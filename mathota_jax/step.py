@@ -183,11 +183,8 @@ def _constrain(
     if scene.joints:
         joints = joint.joint_rows(model, bodies)
         middle = joint.joint_rows(model, joint.midpoint(bodies, model.dt))
-        # Damping acts over the time between two sweeps.
-        small = scene.options.solver == "soft_step"
-        row_model = dataclasses.replace(model, dt=model.dt / scene.options.substep_count) if small else model
         joint_rows = tuple(
-            joint.velocity_rows(scene, table, row_model, joints, middle, inertia) for table in joint.joint_tables(scene)
+            joint.velocity_rows(scene, table, model, joints, middle, inertia) for table in joint.joint_tables(scene)
         )
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
@@ -264,7 +261,7 @@ def _small_steps(
         errors = (*joints, *errors)
     count = options.substep_count
     start = tuple(impulse / count for impulse in start)
-    rebound_sweeps = options.velocity_iterations if scene.restitution else 0
+    rebound_sweeps = options.velocity_iterations if scene.restitution and problem.contact_rows else 0
     added, lever_sum, impulses = soft_step.solve(count, rebound_sweeps, rows, errors, begin, end, start, model.dt)
     return end + added, lever_sum, impulses
 

@@ -166,11 +166,14 @@ def velocity_rows(
     curvature = select(table, middle.rate - joints.rate)
     worlds = max(mass.shape[-1], error.shape[-1])
     pull = scene.options.baumgarte * error / model.dt
-    decay = jnp.clip(damping * mass * model.dt, 0.0, LARGEST_DECAY)
+    # The small steps damp by implicit Euler in each substep and have a bias of their own.
+    small = scene.options.solver == "soft_step"
+    time = model.dt / scene.options.substep_count if small else model.dt
+    decay = jnp.clip(damping * mass * time, 0.0, LARGEST_DECAY)
     # Where nothing is damped the row is void: an infinite softness, expressed by a zero effective mass.
     moves = ~damped | (decay > 0)
     safe_decay = jnp.where(damped & (decay > 0), decay, 1.0)
-    end_weight = _end_weight(safe_decay)
+    end_weight = jnp.ones_like(safe_decay) if small else _end_weight(safe_decay)
     softness = jnp.where(damped & (decay > 0), mass / (end_weight * safe_decay), 0.0)
     start_rate = select(table, joints.rate) * (1.0 / end_weight - 1.0)
     bias = jnp.where(damped, start_rate, jnp.where(one_sided & (error > 0), error / model.dt, pull))

@@ -62,7 +62,7 @@ class PositionError:
       start: at the start of the step; of a one-sided row it is a gap, negative where there is overlap.
       limit: largest velocity of a correction; 0 for a row without a position error, which the first sweep leaves alone.
       one_sided: whether the row only pushes, (turn, 1, column, 1), or of size 1.
-      lever: time [s] that the impulse of a bounce has to act on the position; None for rows that do not bounce.
+      lever: time [s] that the impulse of a bounce has to act on the position; None for joints.
       curvature: what the turning of the Jacobian adds to ``J v`` in half a step; None where it does not turn.
     """
 
@@ -144,7 +144,9 @@ def solve(
       the impulses of the whole step.
     """
     length = dt / substeps
-    couplings = tuple(_coupling(group) if _is_contact(group) else None for group in rows)
+    couplings = tuple(
+        None if error.lever is None else _coupling(group) for group, error in zip(rows, errors, strict=True)
+    )
     begin = tuple(pgs.row_velocity(group, velocity) for group in rows)
     gain = tuple(pgs.row_velocity(group, free - velocity) / dt for group in rows)
     added = pgs.add_impulses(rows, jnp.zeros_like(velocity), impulses)
@@ -258,10 +260,6 @@ def _sweep_jvp(count: int, primals: tuple, tangents: tuple) -> tuple:
         return _sweep.fun(count, everywhere, *others)
 
     return jax.jvp(sweep_all_turns, primals, tangents)
-
-
-def _is_contact(group: Rows) -> bool:
-    return isinstance(group.law, Cone) or group.table.together > 1
 
 
 def _coupling(group: Rows) -> Array:
