@@ -24,6 +24,7 @@ from mathota_jax.bodies import (
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
 from mathota_jax.constraints import compact, contact, joint, warm_start
 from mathota_jax.constraints.assembly import Side, collect
+from mathota_jax.constraints.lever import levers
 from mathota_jax.dynamics.free_motion import free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
@@ -127,13 +128,15 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     force, torque = _external(model, state, bodies, action)
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = _constrain(model, state, bodies, blocks, inertia, free)
-    start = _warm_start(model, state, problem)
+    packed = _pack(scene, *free)
+    start = _warm_start(model, state, problem, inertia, packed)
+    lever, gained = None, None
     if scene.options.solver == "soft_step":
-        solved, lever_sum, impulses = _small_steps(model, problem, blocks, free, start)
+        solved, gained, impulses = _small_steps(model, problem, blocks, packed, start)
     else:
-        solved, impulses = _solve(scene, problem, _pack(scene, *free), start)
-        lever_sum = _lever_sum(model.dt, problem, impulses, jnp.zeros_like(solved))
-    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever_sum, model.dt)
+        solved, impulses = _solve(scene, problem, packed, start)
+        lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
+    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt, gained)
     moved, displacement = compute_once((moved, displacement), state.position)
     if scene.options.solver == "pgs":
         moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
@@ -215,7 +218,7 @@ def _constrain(
     return _Problem(joints, middle, joint_rows, contacts, contact_rows, close)
 
 
-def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, ...]:
+def _warm_start(model: Model, state: State, problem: _Problem, inertia: Inertia, velocity: Array) -> tuple[Array, ...]:
     """Impulses to start from: those of the last step where rows and features are the same (guide 12.4)."""
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
@@ -232,6 +235,8 @@ def _warm_start(model: Model, state: State, problem: _Problem) -> tuple[Array, .
             )
         force = compute_once(warm_start.join_forces(parts), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
+        if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver == "pgs":
+            return warm_start.plausible(problem.rows, inertia, velocity, tuple(start))
     return tuple(start)
 
 
@@ -247,11 +252,11 @@ def _solve(
 
 
 def _small_steps(
-    model: Model, problem: _Problem, blocks: Bodies, free: tuple[Vec3, Vec3], start: tuple[Array, ...]
+    model: Model, problem: _Problem, blocks: Bodies, free: Array, start: tuple[Array, ...]
 ) -> tuple[Array, Array, tuple[Array, ...]]:
     """Phases 5 to 7 in small steps: velocities, displacements by the impulses, and the impulses of the whole step."""
     scene, options, rows = model.scene, model.scene.options, problem.rows
-    begin, end = _pack(scene, blocks.velocity, blocks.angular_velocity), _pack(scene, *free)
+    begin, end = _pack(scene, blocks.velocity, blocks.angular_velocity), free
     worlds = max([begin.shape[-1], end.shape[-1], *(group.bias.shape[-1] for group in rows)])
     begin, end = (jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds)) for velocity in (begin, end))
     errors = tuple(contact.position_error(scene, group, model, worlds) for group in problem.contact_rows)
@@ -262,20 +267,12 @@ def _small_steps(
     count = options.substep_count
     start = tuple(impulse / count for impulse in start)
     rebound_sweeps = options.velocity_iterations if scene.restitution and problem.contact_rows else 0
-    added, lever_sum, impulses = soft_step.solve(count, rebound_sweeps, rows, errors, begin, end, start, model.dt)
-    return end + added, lever_sum, impulses
+    added, gained, impulses = soft_step.solve(count, rebound_sweeps, rows, errors, begin, end, start, model.dt)
+    return end + added, gained, impulses
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:
     return scene.options.gradient_iterations or 2 * iterations
-
-
-def _lever_sum(dt: Array, problem: _Problem, impulses: tuple[Array, ...], zero: Array) -> Array:
-    """Displacement caused by the impulses: joints hold for the whole step, contacts as long as they last."""
-    count = len(problem.joint_rows)
-    halves = [impulse * (0.5 * dt) for impulse in impulses[:count]]
-    levers = [impulse * group.lever for impulse, group in zip(impulses[count:], problem.contact_rows, strict=True)]
-    return pgs.add_impulses(problem.rows, zero, (*halves, *levers))
 
 
 def _correct_positions(
@@ -302,7 +299,7 @@ def _correct_positions(
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
-    return displace(moved, correction)
+    return displace(moved, inertia, correction)
 
 
 def _merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:

@@ -1,7 +1,7 @@
 """Contact rows: non-penetration, restitution at the time of impact, isotropic friction (guide 8 and 9).
 
 A row acts on the velocities at the *end* of the step, while the position moves by
-``dt (v_start + v_free) / 2 + lever * M^-1 J^T impulse``: the impulse of a contact that lasts the whole step acts, on
+``dt (v_start + v_free) / 2 + lever (v_end - v_free)``: the impulse of a contact that lasts the whole step acts, on
 average, at half time (lever dt/2), that of an impact at its time of impact (lever dt - tau). So a sliding block keeps its
 exact parabola and a bounce at tau is followed by the rest of the step in flight, whose derivative is the saltation matrix.
 """
@@ -61,7 +61,7 @@ class ContactRows(NamedTuple):
 
     Attributes:
       rows: for the velocity solver.
-      lever: (turn, row, column, world) time [s] that an impulse has to act on the position.
+      lever: (turn, 1, column, world) time [s] that the contact's impulse has to act on the position.
       directions: row directions in the world frame, components (turn * column, world).
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.

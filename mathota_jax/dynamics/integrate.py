@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia, unpack_blocks
 from mathota_jax.dynamics.free_motion import rotate_at_constant_momentum
-from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize
+from mathota_jax.spatial.quaternion import exponential, multiply, normalize, rotate
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.vector import Vec3
+from mathota_jax.spatial.vector import Vec3, dot
 
 
 def advance(
@@ -19,13 +21,14 @@ def advance(
     torque: Vec3,
     decay: float | Array,
     solved: Array,
-    lever_sum: Array,
+    lever: Array | None,
     dt: Array,
+    gained: Array | None = None,
 ) -> tuple[Bodies, tuple[Vec3, Vec3]]:
     """Moves the bodies through one step (guide 11.1, phase 6).
 
-    Positions are exact for constant forces: ``x + dt (v_start + v_free) / 2`` plus what the constraint impulses add over
-    their levers. Rotation keeps the angular momentum of the step, which is exact between contacts.
+    Positions are exact for constant forces: ``x + dt (v_start + v_free) / 2`` plus what the constraints add over
+    their lever. Rotation keeps the angular momentum of the step, which is exact between contacts.
 
     Args:
       bodies, inertia: moving bodies at the start of the step.
@@ -33,22 +36,31 @@ def advance(
       torque: external torque, world frame.
       decay: factor by which damping reduces the angular momentum in this step.
       solved: (component, block, world) velocities with all constraint impulses.
-      lever_sum: (component, block, world) ``M^-1 J^T`` impulse times lever, summed.
+      lever: (block, world) time [s] that the velocity change by the constraints had to act on the position.
       dt: time step.
+      gained: (component, block, world) displacement by the constraints where it is known itself, in place of the lever.
 
     Returns:
       Bodies at the end of the step; translation and rotation vector (world frame) of the step.
     """
     free_linear, free_angular = free
     solved_linear, solved_angular = unpack_blocks(solved)
-    lever_linear, lever_angular = unpack_blocks(lever_sum)
-    shift = (bodies.velocity + free_linear) * (0.5 * dt) + lever_linear
+    gained_linear, gained_angular = (None, None) if gained is None else unpack_blocks(gained)
+    if gained_linear is None:
+        assert lever is not None
+        gained_linear = (solved_linear - free_linear) * lever
+    shift = (bodies.velocity + free_linear) * (0.5 * dt) + gained_linear
     start = inertia.apply(bodies.angular_velocity)
     end = (start + torque * dt) * decay
     mean = (start + end) * 0.5
-    if solved_angular is not None and lever_angular is not None:
-        end = end + inertia.apply(solved_angular - free_angular)
-        mean = mean + inertia.apply(lever_angular) / dt
+    if solved_angular is not None:
+        change = inertia.apply(solved_angular - free_angular)
+        end = end + change
+        if gained_angular is not None:
+            mean = mean + inertia.apply(gained_angular) / dt
+        else:
+            assert lever is not None
+            mean = mean + change * (lever / dt)
     mean, end, shift = compute_once((mean, end, shift), bodies.position.x)
     orientation, turn = rotate_at_constant_momentum(bodies.orientation, inertia, mean, dt)
     orientation = compute_once(orientation, bodies.position.x)
@@ -59,15 +71,37 @@ def advance(
         angular = turned.solve(end)
         # One refinement: round-off of the solve alone drifts (measured: 1.2e-4 of the momentum in 1000 float32 steps).
         angular = angular + jax.lax.stop_gradient(turned.solve(end - turned.apply(angular)))
+        angular = angular * _energy_scale(
+            inertia, free_angular if solved_angular is None else solved_angular, angular, end, turn
+        )
         turn = inertia.rotation.apply(turn)
     moved = Bodies(bodies.position + shift, orientation, solved_linear, angular)
     return moved, (shift, turn)
 
 
-def displace(bodies: Bodies, displacement: Array) -> Bodies:
-    """Applies the displacement (component, block, world) of the position correction."""
+def _energy_scale(inertia: Inertia, before: Vec3, after: Vec3, momentum: Vec3, turn: Vec3) -> Array:
+    """Factor on the angular velocity of bodies that turn too fast for the time step.
+
+    Beyond a radian in a step the orientation at the end, and with it the energy that belongs to the momentum, is a matter
+    of chance, which contacts would turn into ever more momentum: there the energy is kept, not the momentum.
+    """
+    unresolved = dot(turn, turn) > 1.0
+    energy, found = dot(before, inertia.apply(before)), dot(after, momentum)
+    ratio = safe_divide(energy, jnp.where(unresolved, found, 1.0))
+    return jnp.where(unresolved, safe_sqrt(ratio), 1.0)
+
+
+def displace(bodies: Bodies, inertia: Inertia, displacement: Array) -> Bodies:
+    """Applies the displacement (component, block, world) of the position correction.
+
+    The angular velocity of a body that is not spherical turns with it, so that its energy stays.
+    """
     linear, angular = unpack_blocks(displacement)
-    orientation: Quaternion = bodies.orientation
-    if angular is not None:
-        orientation = normalize(multiply(exponential(angular), orientation))
-    return bodies._replace(position=bodies.position + linear, orientation=orientation)
+    moved = bodies._replace(position=bodies.position + linear)
+    if angular is None:
+        return moved
+    turn = exponential(angular)
+    moved = moved._replace(orientation=normalize(multiply(turn, bodies.orientation)))
+    if inertia.rotation is None:
+        return moved
+    return moved._replace(angular_velocity=rotate(turn, bodies.angular_velocity))

@@ -236,11 +236,15 @@ def row_velocity(group: Rows, velocity: Array) -> Array:
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
     for group, impulse in zip(rows, impulses, strict=True):
-        velocity = _add_responses(group, group.response, velocity, impulse)
+        velocity = add_scaled(group, group.response, velocity, impulse)
     return velocity
 
 
-def _add_responses(group: Rows, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
+def add_scaled(group: Rows, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
+    """Adds to each block the impulses of its rows times `response`.
+
+    That is, for each side, (turn, row, component, column, world); the components may be others than those of a velocity.
+    """
     table = group.table
     if group.places is not None:
         return _add_at_places(group.places, table.together, response, velocity, impulse)
@@ -276,7 +280,7 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        d_velocity = _add_responses(group, d_group.response, d_velocity, impulse)
+        d_velocity = add_scaled(group, d_group.response, d_velocity, impulse)
     jacobians, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
         error = group.bias + row_velocity(group, velocity)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.vector import Mat3, Vec3, dot
+from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot
 
 
 class Quaternion(NamedTuple):
@@ -27,6 +27,13 @@ def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
         p.w * q.y - p.x * q.z + p.y * q.w + p.z * q.x,
         p.w * q.z + p.x * q.y - p.y * q.x + p.z * q.w,
     )
+
+
+def rotate(q: Quaternion, v: Vec3) -> Vec3:
+    """The vector turned by a unit quaternion."""
+    axis = Vec3(q.x, q.y, q.z)
+    twice = cross(axis, v) * 2.0
+    return v + twice * q.w + cross(axis, twice)
 
 
 def normalize(q: Quaternion) -> Quaternion:
