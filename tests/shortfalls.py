@@ -11,8 +11,8 @@ SWEEPS = "not converged with the default 10 sweeps; "
 SHORTFALLS: dict[str, str] = {
     "tests/physics/test_soft_step.py::test_chain_holds[10]": "the whip of the free end opens a joint by 1.41 % of a link "
     "for one step of 600, gate 1 %",
-    "tests/physics/test_soft_step.py::test_third_apex_of_a_dropped_sphere": "the impulse of an impact starts the next substep "
-    "too, and the ball sinks by up to 0.07 mm: at e = 0.25 the third apex, 0.24 mm high, is 1.5 % off, gate 1 %",
+    "tests/physics/test_soft_step.py::test_third_apex_of_a_dropped_sphere": "the impulse of an impact starts the next "
+    "substep too, and the ball sinks by up to 0.07 mm: at e = 0.25 the third apex, 0.24 mm high, is 1.5 % off, gate 1 %",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/physics/test_billiards.py::test_oblique_collision": EVENTS + "positions 6.6e-3 m off at dt 1/240, gate 1e-3",
