@@ -63,6 +63,14 @@ class Bodies(NamedTuple):
     angular_velocity: Vec3
 
 
+class Edges(NamedTuple):
+    """Connections of bodies: handles `first` and `second`, and whether each exists; all of shape (edge, world or 1)."""
+
+    first: Array
+    second: Array
+    active: Array
+
+
 def vector(array: Array) -> Vec3:
     """Components of an (element, 3, world) array."""
     return Vec3(*unstack(array, 1))
@@ -83,6 +91,13 @@ def unpack(state: State) -> Bodies:
 def moving(scene: Scene, bodies: Bodies) -> Bodies:
     """The bodies that are not static, in order: the velocity blocks of the solver."""
     return take(bodies, scene.dynamic_bodies)
+
+
+def of_all_bodies(scene: Scene, blocks: Vec3) -> Vec3:
+    """Values of all bodies from those of the moving ones; 0 for the static ones."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    index = [block_of.get(body, len(block_of)) for body in range(scene.body_count)]
+    return take(blocks.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])), index)
 
 
 def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inertia:

@@ -13,17 +13,17 @@ from jax import Array
 
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.plan import plan_broadphase
-from mathota_jax.constraints.joint import joint_row_count
-from mathota_jax.constraints.joints import JOINTS
-from mathota_jax.declarations import UNTURNED, Body, Joint, Motor, boolean, limits, look_up, mass_properties, number
+from mathota_jax.constraints.joint_layout import joint_row_count
+from mathota_jax.declarations import UNTURNED, Body, boolean, look_up, mass_properties, number
 from mathota_jax.geometry import SHAPES, Compound, Shape
 from mathota_jax.geometry.validation import finite_vector, unit_quaternion
+from mathota_jax.joint_declarations import Joint, Motor, declare_joint, declare_motor, kind_of
 from mathota_jax.model import Model
 from mathota_jax.options import Options
-from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate, rotate_back
-from mathota_jax.scene import JointEntry, PairGroup, Scene, ShapeEntry
+from mathota_jax.rotation import rotate
+from mathota_jax.scene import JointEntry, MotorEntry, PairGroup, Scene, ShapeEntry
 from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
-from mathota_jax.state import State
+from mathota_jax.state import Sleep, State
 
 
 class SceneBuilder:
@@ -126,59 +126,51 @@ class SceneBuilder:
         """Adds a joint at the present poses of its bodies and returns its handle.
 
         Args:
-          joint: a joint declaration such as `Hinge`; anchor and axis in the world frame.
+          joint: a joint declaration such as `Hinge`; anchors and axis in the world frame.
           name: unique name; "joint0", "joint1", ... by default.
         """
         name = self._new_name(name, "joint", [joint.name for joint in self._joints])
         label = f"joint '{name}'"
-        kind = next((key for key, value in JOINTS.items() if isinstance(joint, value.declaration)), None)
-        if kind is None:
-            known = ", ".join(value.declaration.__name__ for value in JOINTS.values())
-            raise ValueError(f"{label}: must be one of {known}, got {joint!r}")
+        kind = kind_of(label, joint)
         parent, child = (self.body(getattr(joint, side), f"{label}: {side}") for side in ("parent", "child"))
         if parent == child:
             raise ValueError(f"{label}: parent and child are the same body '{self._bodies[parent].name}'")
         if self._bodies[parent].static and self._bodies[child].static:
             raise ValueError(f"{label}: parent and child are both static; at least one must move")
-        anchor = finite_vector(f"{label}: anchor", joint.anchor)
-        axis = finite_vector(f"{label}: axis", joint.axis)
-        if not np.any(axis):
-            raise ValueError(f"{label}: axis must not be the zero vector")
-        frame = frame_with_axis(axis)
-        ends = [self._bodies[body] for body in (parent, child)]
-        anchors = [rotate_back(end.orientation, anchor - end.position) for end in ends]
-        frames = [relative_rotation(end.orientation, frame) for end in ends]
-        self._joints.append(
-            Joint(
-                name,
-                kind,
-                parent,
-                child,
-                *anchors,
-                *frames,
-                limits=limits(label, joint.limits, JOINTS[kind].angular),
-                damping=number(f"{label}: damping", joint.damping, 0.0, math.inf),
-            )
-        )
+        self._joints.append(declare_joint(name, kind, joint, parent, child, self._bodies))
         return len(self._joints) - 1
 
-    def add_motor(self, joint: int | str, kind: str = "torque", limit: float = 1.0, gear: float = 1.0) -> int:
-        """Drives the free coordinate of a joint and returns the index of its entry in the action vector.
+    def add_motor(
+        self,
+        joint: int | str,
+        kind: str = "torque",
+        limit: float = 1.0,
+        gear: float = 1.0,
+        *,
+        cap: float | None = None,
+        stiffness: float = 0.0,
+        damping: float = 0.0,
+    ) -> int:
+        """Drives the coordinate of a joint and returns the index of its entry in the action vector.
+
+        The command is the action, clipped to `limit`, times `gear`. "torque": it is the torque [N m] of a hinge or the
+        force [N] of a slider or distance joint. "velocity": it is the rate that the motor keeps with a torque of at most
+        `cap`. "position": it is the coordinate c to which the motor pulls like a spring and damper, with the torque
+        ``stiffness (c - coordinate) - damping rate`` clipped to `cap`; implicit, so that any stiffness is stable.
 
         Args:
-          joint: handle or name of the joint.
-          kind: "torque": the action times `gear` is the torque [N m] of a hinge or the force [N] of a slider.
+          joint: handle or name of the joint, which must have a single free coordinate.
+          kind: "torque", "velocity" or "position".
           limit: largest absolute action; larger actions are clipped.
-          gear: torque or force per unit of action.
+          gear: command per unit of action.
+          cap: largest torque [N m] or force [N] of a velocity or position motor; None for no bound.
+          stiffness: of a position motor [N m/rad] or [N/m], positive.
+          damping: of a position motor [N m s/rad] or [N s/m].
         """
         index = self.joint(joint, "add_motor: joint")
-        label = f"motor on joint '{self._joints[index].name}'"
-        if kind != "torque":
-            raise ValueError(f'{label}: kind must be "torque", got {kind!r}')
-        limit = number(f"{label}: limit", limit, 0.0, math.inf)
-        if limit == 0:
-            raise ValueError(f"{label}: limit must be positive, got 0")
-        self._motors.append(Motor(index, limit, number(f"{label}: gear", gear, -math.inf, math.inf)))
+        declared = self._joints[index]
+        given = {"limit": limit, "gear": gear, "cap": cap, "stiffness": stiffness, "damping": damping}
+        self._motors.append(declare_motor(f"motor on joint '{declared.name}'", declared, index, kind, given))
         return len(self._motors) - 1
 
     def body(self, body: int | str, label: str = "body") -> int:
@@ -215,6 +207,10 @@ class SceneBuilder:
             sorted(joined),
             options,
         )
+        if broadphase and options.continuous:
+            raise ValueError(
+                'build: Options.continuous follows pairs that have contact slots of their own; pass broadphase="none"'
+            )
         groups = self._pair_groups(table, frozenset(broadphase.shapes) if broadphase else frozenset())
         pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
         if broadphase:
@@ -230,10 +226,10 @@ class SceneBuilder:
             faces=table.faces,
             pair_groups=groups,
             joints=tuple(
-                JointEntry(joint.kind, joint.parent, joint.child, joint.limits is not None, joint.damping > 0)
-                for joint in self._joints
+                JointEntry(joint.kind, joint.parent, joint.child, (*joint.features, *self._motor_rows(index)))
+                for index, joint in enumerate(self._joints)
             ),
-            motors=tuple(motor.joint for motor in self._motors),
+            motors=tuple(MotorEntry(motor.joint, motor.kind) for motor in self._motors),
             friction=any(bodies[a].friction * bodies[b].friction > 0 for a, b in pairs),
             restitution=any(min(bodies[a].restitution, bodies[b].restitution) > 0 for a, b in pairs),
             # dt is a leaf of the model: scenes that differ in it alone share a compilation.
@@ -245,7 +241,6 @@ class SceneBuilder:
 
     def _model(self, scene: Scene, table: ShapeTable, dt: float) -> Model:
         bodies, joints = self._bodies, self._joints
-        unlimited = np.asarray([-np.inf, np.inf])
         turned = any(np.any(body.inertia_frame != UNTURNED) for body in bodies)
         return Model(
             dt=_floats(dt),
@@ -265,18 +260,29 @@ class SceneBuilder:
             joint_anchor_child=_floats([joint.anchor_child for joint in joints], (0, 3)),
             joint_frame_parent=_floats([joint.frame_parent for joint in joints], (0, 4)),
             joint_frame_child=_floats([joint.frame_child for joint in joints], (0, 4)),
-            joint_limits=_floats([unlimited if j.limits is None else j.limits for j in joints], (0, 2)),
-            joint_damping=_floats([joint.damping for joint in joints]),
-            motor_limit=_floats([motor.limit for motor in self._motors]),
-            motor_gear=_floats([motor.gear for motor in self._motors]),
+            joint_limits=_floats([joint.limits for joint in joints], (0, 2)),
+            **{
+                f"joint_{name}": _floats([getattr(joint, name) for joint in joints])
+                for name in ("swing", "damping", "friction", "stiffness", "rest", "armature")
+            },
+            **{
+                f"motor_{name}": _floats([getattr(motor, name) for motor in self._motors])
+                for name in ("limit", "gear", "cap", "stiffness", "damping")
+            },
             scene=scene,
         )
 
+    def _motor_rows(self, joint: int) -> list[str]:
+        """Motors of a joint that are rows of it."""
+        return [motor.kind for motor in self._motors if motor.joint == joint and motor.kind != "torque"]
+
     def _state(self, scene: Scene) -> State:
         bodies = self._bodies
+        position = _floats([body.position for body in bodies])
+        orientation = _floats([body.orientation for body in bodies])
         return State(
-            position=_floats([body.position for body in bodies]),
-            orientation=_floats([body.orientation for body in bodies]),
+            position=position,
+            orientation=orientation,
             velocity=_floats([body.velocity for body in bodies]),
             angular_velocity=_floats([body.angular_velocity for body in bodies]),
             applied_force=_floats(np.zeros((len(bodies), 3))),
@@ -286,6 +292,13 @@ class SceneBuilder:
             joint_force=_floats(np.zeros(joint_row_count(scene))),
             flags=jnp.zeros((), jnp.int32),
             contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
+            sleep=Sleep(
+                time=_floats(np.zeros(len(bodies))),
+                asleep=jnp.zeros(len(bodies), bool),
+                pose=jnp.concatenate([position, orientation], axis=1),
+            )
+            if scene.options.sleep
+            else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:

@@ -1,4 +1,4 @@
-"""What a builder has been told, checked: bodies, joints and motors, in NumPy float64."""
+"""What a builder has been told of bodies, checked, in NumPy float64; checks of numbers, flags and handles."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from jax import Array
 
 from mathota_jax.geometry import Compound, Shape
 from mathota_jax.geometry.inertia import principal_axes
-
-OUT_OF_REACH = 1e9
-"""Joint limit [m] that stands for none."""
 
 UNTURNED = np.asarray([1.0, 0.0, 0.0, 0.0])
 
@@ -39,31 +36,6 @@ class Body:
     angular_velocity: np.ndarray
     friction: float
     restitution: float
-
-
-@dataclasses.dataclass
-class Joint:
-    """A joint; anchors from the centres of mass and frames in the body frames."""
-
-    name: str
-    kind: str
-    parent: int
-    child: int
-    anchor_parent: np.ndarray
-    anchor_child: np.ndarray
-    frame_parent: np.ndarray
-    frame_child: np.ndarray
-    limits: np.ndarray | None
-    damping: float
-
-
-@dataclasses.dataclass
-class Motor:
-    """A motor on the free coordinate of a joint."""
-
-    joint: int
-    limit: float
-    gear: float
 
 
 def mass_properties(
@@ -100,24 +72,6 @@ def boolean(label: str, value: Any) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{label} must be True or False, got {value!r}")
     return bool(value)
-
-
-def limits(label: str, value: Any, angular: bool) -> np.ndarray | None:
-    """Lower and upper limit of a joint, or None."""
-    if value is None:
-        return None
-    try:
-        pair = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        pair = np.zeros(0)
-    if pair.shape != (2,) or np.any(np.isnan(pair)):
-        raise ValueError(f"{label}: limits must be a pair (lower, upper) of numbers, got {value!r}")
-    if pair[0] > pair[1]:
-        raise ValueError(f"{label}: lower limit {pair[0]:g} is larger than upper limit {pair[1]:g}; swap them")
-    if angular and (pair[0] < -math.pi or pair[1] > math.pi):
-        raise ValueError(f"{label}: limits of a hinge must lie between -pi and pi rad, got {value!r}")
-    # An open side becomes a stop out of reach: an infinite error would turn into NaN in derivatives.
-    return np.clip(pair, -OUT_OF_REACH, OUT_OF_REACH)
 
 
 def look_up(label: str, handle: Any, names: list[str], noun: str) -> int:

@@ -7,9 +7,9 @@ from jax import Array
 
 from mathota_jax.batching import batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack, vector
-from mathota_jax.collision.narrowphase import find_contacts, join_contacts
-from mathota_jax.constraints import compact
-from mathota_jax.constraints.joint import joint_coordinates
+from mathota_jax.constraints.joint_layout import joint_row_count
+from mathota_jax.constraints.joint_rows import joint_coordinates, moved_by, reactions
+from mathota_jax.constraints.slots import bodies_of_slots, find_slots
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.vector import Vec3, cross, dot
@@ -51,22 +51,12 @@ def contacts(model: Model, state: State) -> Contacts:
 @batch_last
 def _contacts(model: Model, state: State) -> Contacts:
     scene = model.scene
-    bodies = unpack(state)
-    body_a, body_b = (jnp.asarray(side, jnp.int32).reshape(-1, 1) for side in scene.slot_bodies)
     if not scene.slot_count:
         none = state.position[:0, 0]
+        body_a, body_b = bodies_of_slots(scene, None)
         return Contacts(state.position[:0], state.position[:0], none, none > 0, none.astype(jnp.int32), body_a, body_b)
-    parts = []
-    if scene.pair_groups:
-        parts.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
-    if scene.broadphase:
-        close = compact.close_pairs(model, bodies, None)
-        parts += compact.contacts_of(model, bodies, close)
-        body_a, body_b = (
-            jnp.concatenate([jnp.broadcast_to(own, (own.shape[0], more.shape[-1])), more])
-            for own, more in zip((body_a, body_b), compact.slot_bodies(scene, close), strict=True)
-        )
-    found = join_contacts(parts)
+    found, close = find_slots(model, unpack(state), None)
+    body_a, body_b = bodies_of_slots(scene, close)
     position, normal = (jnp.stack(list(v), axis=1) for v in (found.position, found.normal))
     return Contacts(position, normal, found.separation, found.active, found.feature, body_a, body_b)
 
@@ -121,12 +111,16 @@ def _angular_momentum(model: Model, state: State) -> Array:
 
 
 def joint_position(model: Model, state: State) -> Array:
-    """Free coordinate of each joint, (joint,): angle [rad] or displacement [m] of the child from the built pose."""
+    """Coordinate of each joint, (joint,). Differentiable.
+
+    Angle [rad] of a hinge and displacement [m] of a slider from the built pose, twist [rad] of a ball and socket, length
+    [m] of a distance joint; 0 for a fixed joint.
+    """
     return _joint_coordinates(model, state)[0]
 
 
 def joint_velocity(model: Model, state: State) -> Array:
-    """Rate of the free coordinate of each joint, (joint,) [rad/s] or [m/s]."""
+    """Rate of the coordinate of each joint, (joint,) [rad/s] or [m/s]. Differentiable."""
     return _joint_coordinates(model, state)[1]
 
 
@@ -135,6 +129,38 @@ def _joint_coordinates(model: Model, state: State) -> tuple[Array, Array]:
     if not model.scene.joints:
         return state.joint_force, state.joint_force
     return joint_coordinates(model, unpack(state))
+
+
+def joint_forces(model: Model, state: State) -> tuple[Array, Array]:
+    """Mean force and torque over the last step that each joint exerted on its child at the child's anchor.
+
+    All that acts in the joint counts: what holds it, its stops, spring, damper, friction and its velocity and position
+    motors. A torque motor does not: its torque is the action, an outer load like gravity. Accurate to second order at the
+    middle of the step, half a step before `state`. The parent feels the opposite force at the same place. A distance joint
+    exerts its force along the line: tension on the child points towards the parent's anchor. Differentiable.
+
+    Returns:
+      Force (joint, 3) [N] and torque (joint, 3) [N m], world frame; 0 before the first step.
+
+    Raises:
+      ValueError: the state belongs to another scene.
+    """
+    row_count = joint_row_count(model.scene)
+    if state.joint_force.shape[-1:] != (row_count,):
+        raise ValueError(
+            f"joint_forces: the state has {state.joint_force.shape[-1]} joint rows, the model {row_count}: they belong to "
+            "different scenes"
+        )
+    return _joint_forces(model, state)
+
+
+@batch_last
+def _joint_forces(model: Model, state: State) -> tuple[Array, Array]:
+    if not model.scene.joints:
+        return state.position[:0], state.position[:0]
+    middle = moved_by(unpack(state), -0.5 * model.dt)
+    force, torque = (jnp.stack(list(v), axis=1) for v in reactions(model, middle, state.joint_force))
+    return force, torque
 
 
 def _check(model: Model, state: State) -> None:

@@ -31,10 +31,19 @@ class Model:
       joint_anchor_parent, joint_anchor_child: (joint, 3) anchor from the centre of mass, body frame [m].
       joint_frame_parent, joint_frame_child: (joint, 4) orientation of the joint frame in each body, quaternion; the x axis
         is the axis of the joint.
-      joint_limits: (joint, 2) lower and upper limit [rad] or [m].
+      joint_limits: (joint, 2) lower and upper limit [rad] or [m]: the angle of a hinge, displacement of a slider, twist of
+        a ball, length of a distance joint. A coordinate whose limits are equal is held at their mean.
+      joint_swing: (joint,) half angle of the cone of a ball joint's axis [rad].
       joint_damping: (joint,) viscous coefficient [N m s/rad] or [N s/m].
+      joint_friction: (joint,) largest dry friction [N m] or [N].
+      joint_stiffness: (joint,) of the spring [N m/rad] or [N/m].
+      joint_rest: (joint,) coordinate at which the spring is slack [rad] or [m].
+      joint_armature: (joint,) inertia of a rotor that turns with the coordinate [kg m^2] or [kg].
       motor_limit: (motor,) largest absolute action.
-      motor_gear: (motor,) torque [N m] or force [N] per unit of action.
+      motor_gear: (motor,) torque [N m] or force [N], target rate or target coordinate per unit of action.
+      motor_cap: (motor,) largest torque [N m] or force [N] of a velocity or position motor.
+      motor_stiffness: (motor,) of a position motor [N m/rad] or [N/m].
+      motor_damping: (motor,) of a position motor [N m s/rad] or [N s/m].
       scene: static structure.
     """
 
@@ -52,7 +61,15 @@ class Model:
     joint_frame_parent: Array
     joint_frame_child: Array
     joint_limits: Array
+    joint_swing: Array
     joint_damping: Array
+    joint_friction: Array
+    joint_stiffness: Array
+    joint_rest: Array
+    joint_armature: Array
     motor_limit: Array
     motor_gear: Array
+    motor_cap: Array
+    motor_stiffness: Array
+    motor_damping: Array
     scene: Scene = static()

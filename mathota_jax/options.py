@@ -8,7 +8,7 @@ from typing import Any
 
 BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
 
-SOLVER_CHOICES = ("pgs", "soft_step")
+SOLVER_CHOICES = ("pgs", "converged", "soft_step")
 
 DEFAULT_SUBSTEPS = 4
 
@@ -39,12 +39,28 @@ class Options:
         "sort_and_sweep", "grid", "bvh". Guide 5.4.
       pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
-      solver: "pgs": projected Gauss-Seidel with position correction. "soft_step": one collision pass and several substeps
-        of two sweeps each, which also take out position errors and are differentiated as they are. Of the settings above,
+      solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
+        together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
+        solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm
+        started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32 and 6e-6 m of
+        movement, but 26 CPU-s to compile. Of the numbers of iterations above only `position_iterations=0`, which leaves
+        positions alone, means anything to it. "soft_step": one collision pass and several substeps of two sweeps each,
+        which also take out position errors and are differentiated as they are. Of the settings above,
         `position_iterations`, `slop`, `position_percent`, `baumgarte` and `gradient_iterations` do not concern it, and
-        `velocity_iterations` is the number of sweeps of its restitution pass. Guide 11.3 (fixed time step) and
-        `solver.soft_step`.
-      substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square.
+        `velocity_iterations` is the number of sweeps of its restitution pass. See `solver.soft_step`.
+      substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.
+      continuous: check the motion of fast bodies for what they meet on their way and stop them at the first touch, to be
+        handled in the next step. Off: absent; contacts found at the start of a step are then extrapolated over it, which
+        is exact for bodies that hit what they head for, but lets fast turning ones slip through and stops others at what
+        they would have passed. Guide 10.4.
+      sleep: let islands of bodies at rest sleep until something disturbs them; off: absent. Guide 3.4 and 12.2. A body
+        asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing.
+      sleep_velocity: speed below which a body may be at rest [m/s]. Guide 11.3. It belongs to things about a metre long
+        under the gravity of the Earth: in other scenes it should grow with the square root of length times gravity.
+      sleep_angular_velocity: angular speed below which a body may be at rest [rad/s]; grows with the square root of
+        gravity over length.
+      sleep_time: how long all bodies of an island must be at rest before it sleeps [s]; grows with the square root of
+        length over gravity.
     """
 
     dt: float = 1 / 60
@@ -61,6 +77,11 @@ class Options:
     gradient_iterations: int | None = None
     solver: str = "pgs"
     substeps: int | None = None
+    continuous: bool = False
+    sleep: bool = False
+    sleep_velocity: float = 0.05
+    sleep_angular_velocity: float = 0.05
+    sleep_time: float = 0.5
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and self.dt > 0):
@@ -78,11 +99,14 @@ class Options:
             value = getattr(self, name)
             if not (_is_number(value) and 0 <= value <= 1):
                 raise ValueError(f"Options.{name} must lie between 0 and 1, got {value!r}")
-        if not isinstance(self.warm_start, bool):
-            raise ValueError(f"Options.warm_start must be True or False, got {self.warm_start!r}")
-        if self.broadphase not in BROADPHASE_CHOICES:
-            known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
-            raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")
+        for name in ("sleep_velocity", "sleep_angular_velocity", "sleep_time"):
+            value = getattr(self, name)
+            if not (_is_number(value) and value > 0):
+                raise ValueError(f"Options.{name} must be a positive finite number, got {value!r}")
+        for name in ("warm_start", "continuous", "sleep"):
+            value = getattr(self, name)
+            if not isinstance(value, bool):
+                raise ValueError(f"Options.{name} must be True or False, got {value!r}")
         if self.solver not in SOLVER_CHOICES:
             known = ", ".join(repr(choice) for choice in SOLVER_CHOICES)
             raise ValueError(f"Options.solver must be one of {known}, got {self.solver!r}")
@@ -91,6 +115,9 @@ class Options:
                 f"Options.substeps = {self.substeps} needs solver='soft_step', got solver={self.solver!r}; "
                 "for smaller steps of this solver divide dt instead"
             )
+        if self.broadphase not in BROADPHASE_CHOICES:
+            known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
+            raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")
 
     @property
     def substep_count(self) -> int:

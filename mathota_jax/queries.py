@@ -35,7 +35,7 @@ to the approach itself, less one."""
 NaturalPose = tuple[Any, Any]
 
 
-class Distance(NamedTuple):
+class ClosestPoints(NamedTuple):
     """Closest points of two shapes.
 
     Attributes:
@@ -83,10 +83,10 @@ class Impact(NamedTuple):
 
     time: Array
     hit: Array
-    distance: Distance
+    distance: ClosestPoints
 
 
-def signed_distance(shape_a: Any, pose_a: NaturalPose, shape_b: Any, pose_b: NaturalPose) -> Distance:
+def signed_distance(shape_a: Any, pose_a: NaturalPose, shape_b: Any, pose_b: NaturalPose) -> ClosestPoints:
     """Signed distance of two shapes with the points where it is attained.
 
     Differentiable in the poses and, where a `Geometry` is given, in its sizes, except where the closest features change
@@ -273,7 +273,7 @@ def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> _Nearest:
     return _Nearest(separation, normal, position - half, position + half, converged)
 
 
-def _natural(nearest: _Nearest) -> Distance:
+def _natural(nearest: _Nearest) -> ClosestPoints:
     worlds = np.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(nearest)))
 
     def vector(v: Vec3) -> Array:
@@ -281,11 +281,13 @@ def _natural(nearest: _Nearest) -> Distance:
 
     separation = jnp.broadcast_to(nearest.separation, worlds)[0]
     converged = jnp.broadcast_to(nearest.converged, worlds)[0]
-    return Distance(separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b), converged)
+    return ClosestPoints(
+        separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b), converged
+    )
 
 
 @batch_last
-def _distance(a: Geometry, b: Geometry, pose_a: NaturalPose, pose_b: NaturalPose) -> Distance:
+def _distance(a: Geometry, b: Geometry, pose_a: NaturalPose, pose_b: NaturalPose) -> ClosestPoints:
     return _natural(_nearest(a, _pose(pose_a), b, _pose(pose_b)))
 
 
@@ -398,8 +400,8 @@ def _approach(a: _Mover, b: _Mover, time: Array, nearest: _Nearest) -> Array:
 
 
 __all__ = [
+    "ClosestPoints",
     "ContactManifold",
-    "Distance",
     "Geometry",
     "Impact",
     "Shape",

@@ -88,13 +88,24 @@ class Broadphase(NamedTuple):
 
 
 class JointEntry(NamedTuple):
-    """One joint. `limited` and `damped` say whether its limit and damping rows exist."""
+    """One joint. `features` name the rows that it has beside those of its kind, in order.
+
+    "locked": the coordinate is held; "lower", "upper": stops of the coordinate; "swing": cone about the axis; "damping":
+    viscous resistance along each free motion; "spring": stiffness, damping and armature along the coordinate; "friction":
+    dry resistance along each free motion; "velocity", "position": a motor of that kind, one entry for each.
+    """
 
     kind: str
     parent: int
     child: int
-    limited: bool
-    damped: bool
+    features: tuple[str, ...]
+
+
+class MotorEntry(NamedTuple):
+    """One motor; `kind` is "torque", "velocity" or "position"."""
+
+    joint: int
+    kind: str
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,7 +120,7 @@ class Scene:
       pair_groups: admissible pairs by shape kinds (no static-static, no jointed, no excluded pair), but for those that
         the broadphase finds.
       joints: joints in order of adding.
-      motors: joint that each entry of the action drives.
+      motors: what each entry of the action drives.
       friction: whether any admissible pair has friction; otherwise there are no tangent rows.
       restitution: whether any admissible pair bounces; otherwise there is no event code.
       options: the settings, `dt` excepted (a leaf of the model).
@@ -123,7 +134,7 @@ class Scene:
     faces: tuple[tuple[tuple[int, ...], ...], ...]
     pair_groups: tuple[PairGroup, ...]
     joints: tuple[JointEntry, ...]
-    motors: tuple[int, ...]
+    motors: tuple[MotorEntry, ...]
     friction: bool
     restitution: bool
     options: Options

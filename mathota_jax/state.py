@@ -24,6 +24,27 @@ class Flag(enum.IntFlag):
     NOT_CONVERGED = 4
     """The search for the closest points of two shapes ended at its limit; the best bound that it found was used."""
 
+    SOLVER_NOT_CONVERGED = 8
+    """`Options.solver="converged"` ended at its limit of iterations; the best impulses that it found were used."""
+
+    INVALID_TIME_STEP = 16
+    """A step was asked for with a negative or not finite `Model.dt`, or an elapsed time; nothing was done."""
+
+
+@pytree
+class Sleep:
+    """What sleeping needs to remember; exists in scenes built with `Options.sleep`.
+
+    Attributes:
+      time: (body,) how long each body has been at rest [s].
+      asleep: (body,) whether it sleeps.
+      pose: (body, 7) position and orientation at the end of the last step, by which a change by the user is noticed.
+    """
+
+    time: Array
+    asleep: Array
+    pose: Array
+
 
 @pytree
 class State:
@@ -39,10 +60,13 @@ class State:
       applied_torque: (body, 3) torque about the centre of mass accumulated for the next step [N m], world frame.
       contact_force: (slot, 3) mean force of the last step on body B of each contact slot [N], world frame.
       contact_feature: (slot,) feature that held each slot in the last step, -1 for none.
-      joint_force: (joint row,) mean generalized force of each joint row in the last step [N] or [N m].
+      joint_force: (joint row,) mean generalized force of each joint row in the last step [N] or [N m]. Joints of one kind
+        with the same features form a group; rows are numbered group (by its first joint), row (those of the kind, then
+        those of the features in order), joint. `joint_forces` gives them as vectors.
       flags: () bits of `Flag`; 0 when all is well.
       contact_pair: (place,) pair that held each place of the compact groups in the last step, ``first * shapes + second``
         in the numbering of the broadphase, -1 for none; None in scenes without broadphase.
+      sleep: timers of the sleeping system; None unless `Options.sleep`.
     """
 
     position: Array
@@ -56,6 +80,7 @@ class State:
     joint_force: Array
     flags: Array
     contact_pair: Array | None = None
+    sleep: Sleep | None = None
 
 
 def apply_force(state: State, body: int, force: Array, point: Array | None = None) -> State:

@@ -5,6 +5,9 @@ import itertools
 import numpy as np
 from scipy.spatial import ConvexHull
 
+BOX_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+"""Corners of the cube of half size 1."""
+
 
 def hull(points):
     """Vertices (V, 3) and faces (F, K) of a hull: coplanar triangles merged, counter-clockwise, last vertex repeated."""

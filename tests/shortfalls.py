@@ -13,6 +13,9 @@ SHORTFALLS: dict[str, str] = {
     "for one step of 600, gate 1 %",
     "tests/physics/test_soft_step.py::test_third_apex_of_a_dropped_sphere": "the impulse of an impact starts the next "
     "substep too, and the ball sinks by up to 0.07 mm: at e = 0.25 the third apex, 0.24 mm high, is 1.5 % off, gate 1 %",
+    "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
+    "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
+    "its centre ends up to 77 mm in the ground",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/physics/test_billiards.py::test_oblique_collision": EVENTS + "positions 6.6e-3 m off at dt 1/240, gate 1e-3",
@@ -24,16 +27,35 @@ SHORTFALLS: dict[str, str] = {
     + "joint gap 5.6e-3 of the arm, gate 5e-3",
     "tests/physics/test_joints.py::test_hinge_limits_hold[float64-1.0]": SWEEPS
     + "joint gap 5.6e-3 of the arm, gate 5e-3",
-    "tests/physics/test_joints.py::test_double_pendulum_keeps_its_joints_closed[float32]": SWEEPS
-    + "a link ten times as heavy as the one that holds it makes the world diverge after 640 steps",
+    "tests/physics/test_chain.py::test_ten_links_stay_joined[default]": SWEEPS
+    + "joint gap 5.3e-3 of a link, gate 1e-4",
+    "tests/physics/test_chain.py::test_chain_does_not_blow_up_at_a_large_step[20-default]": SWEEPS
+    + "twenty links gain energy without bound and are NaN after 96 steps of 1/60 s",
+    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[default]": "the Jacobian is that of the "
+    "middle of the step, the inertia that of its start: where it is 5000 times less about one axis, a deviation of 1e-16 "
+    "out of the plane grows sixfold a step, and the energy without bound, also with 40 sweeps; 13 times less is stable",
+    "tests/physics/test_chain.py::test_ten_links_stay_joined[converged]": "joint gap 1.4e-3 of a link, gate 1e-4: the error "
+    "of the time step, not of the solver",
+    "tests/physics/test_chain.py::test_chain_does_not_blow_up_at_a_large_step[20-converged]": "twenty links are NaN within "
+    "2 s of steps of 1/60 s: the time step, not the solver, is unstable",
+    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[converged]": "as with the default solver",
+    "tests/physics/test_converged.py::test_a_chain_with_a_heavy_end_does_not_stretch": "stretched by 4.0 % and 6.5 % "
+    "(float32, float64) of a link, gate 1 %: Baumgarte takes back a tenth a step of what the velocities leave",
     "tests/envs/test_ball_balance.py::test_gimbal_holds_the_plate": SWEEPS
     + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
     "tests/unit/test_state.py::test_nothing_assumes_an_up_axis": "the order of the sweeps follows the axes of the tangents: "
     "3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6",
     "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, "
     "then stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
-    "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter": SWEEPS
-    + "positions differ by 0.03 to 0.7 m after a pile has settled, gate 1e-4",
+    "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter[float32]": "balls of 1, 1 and 100 kg on one "
+    "another are balanced on a point: round-off grows 19-fold in ten steps and the pile falls another way, gate 1e-4",
+    **{
+        f"tests/unit/test_converged.py::test_contact_laws_hold[{case}-10000.0]": "mass ratio 1e4 among bodies hit at "
+        "random points, from nothing: the converged solver reaches its limit of 150 iterations or misses the gate"
+        for case in ("float32-1", "float32-2", "float32-3", "float32-4", "float32-5", "float64-3")
+    },
+    "tests/physics/test_converged.py::test_heavy_cube_on_a_light_one[float32-0.016666666666666666]": "mass ratio 1e5 in "
+    "float32: the light cube, not the heavy one, slides 25 mm in 0.5 s, gate 1 mm; 1e8 in float64 passes",
 }
 
 # Limits in CPU seconds, which depend on the machine: a pass is welcome and does not fail the suite.

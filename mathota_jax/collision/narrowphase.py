@@ -14,6 +14,13 @@ from mathota_jax.scene import PairGroup, Scene
 from mathota_jax.spatial.quaternion import Quaternion
 from mathota_jax.spatial.vector import Vec3
 
+SPECULATIVE = 0.5
+"""With `Options.continuous`, contacts count up to this share of the inner radius of the smaller moving body ahead.
+
+Bodies that move by less relative to each other can not pass through each other; what the faster ones meet is found along
+their motion (`dynamics.events`), where a contact far ahead would stop them at things that they fly past.
+"""
+
 
 class ContactSet(NamedTuple):
     """All contact slots of a scene, components of shape (slot, world); slots are numbered group, pair, point.
@@ -39,7 +46,7 @@ def find_contacts(
       shapes: kind -> parameter -> (shape, ..., world).
       position, orientation: of all bodies, components (body, world).
     """
-    return join_contacts([_group_contacts(scene, group, shapes, position, orientation) for group in scene.pair_groups])
+    return join_contacts([group_contacts(scene, group, shapes, position, orientation) for group in scene.pair_groups])
 
 
 def join_contacts(groups: list[ContactSet]) -> ContactSet:
@@ -60,9 +67,10 @@ def _concatenate(values: list[Any], worlds: int) -> Any:
     return jnp.concatenate([jnp.broadcast_to(value, (value.shape[0], worlds)) for value in values])
 
 
-def _group_contacts(
+def group_contacts(
     scene: Scene, group: PairGroup, shapes: dict[str, dict[str, Array]], position: Vec3, orientation: Quaternion
 ) -> ContactSet:
+    """`find_contacts` for one group."""
     parameters_b = shape_parameters(scene, shapes, group.kind_b, group.shapes_b)
     if group.window is not None:
         parameters_b["window"] = group.window

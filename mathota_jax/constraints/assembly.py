@@ -11,16 +11,11 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Inertia
-from mathota_jax.model import Model
-from mathota_jax.scene import Scene
 from mathota_jax.solver.pgs import Places
 from mathota_jax.solver.table import EMPTY, Table, TracedTable
 from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, dot
-
-PUSH_OUT_RATE = 6.0
-"""Largest push-out velocity of the small steps, in radii of the smaller body [1/s]: 3 m/s for a cube of 1 m, as in Box2D."""
 
 
 class Side(NamedTuple):
@@ -65,21 +60,6 @@ def gather_columns(table: TracedTable, index: Array, tree: Any) -> Any:
         return compute_once(jnp.repeat(chosen, table.together, axis=0), chosen)
 
     return jax.tree.map(columns, tree)
-
-
-def push_out_speed(scene: Scene, table: Table | TracedTable, model: Model, places: Places | None = None) -> Array:
-    """Largest velocity (turn * column, world) of a correction: so many radii of the smaller body in a second.
-
-    The radius is the root mean square distance of a body's mass from its centre, since a thin card must not be held to
-    its thickness.
-    """
-    mass, inertia = take((model.mass, model.inertia), scene.dynamic_bodies)
-    radius = jnp.sqrt(inertia.sum(1) / (2.0 * mass))
-    sides = len(places.blocks if isinstance(table, TracedTable) and places else table.blocks)  # type: ignore[union-attr]
-    smallest = select_blocks(table, 0, radius, places)
-    if sides == 2:
-        smallest = jnp.minimum(smallest, select_blocks(table, 1, radius, places))
-    return PUSH_OUT_RATE * smallest
 
 
 def collect(tables: Sequence[Table | TracedTable], values: Sequence[Array], slot_count: int) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.bodies import Bodies
+from mathota_jax.bodies import Bodies, of_all_bodies
 from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.broadphase.ranges import lower_bound
@@ -75,7 +75,7 @@ def close_pairs(model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None) ->
     displacements: tuple[Vec3, ...] = ()
     turn = None
     if free is not None:
-        linear, angular = (_of_all_bodies(scene, v) for v in free)
+        linear, angular = (of_all_bodies(scene, v) for v in free)
         displacements = (bodies.velocity * model.dt, linear * model.dt)
         if _turns_matter(scene, model):
             turn = jnp.maximum(norm(bodies.angular_velocity), norm(angular)) * model.dt
@@ -83,13 +83,6 @@ def close_pairs(model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None) ->
     found = candidate_pairs(plan.method, bounds, admissible_pairs(scene), plan.capacity)
     groups, lost = _places(scene, found)
     return ClosePairs(found, groups, found.overflow | lost)
-
-
-def _of_all_bodies(scene: Scene, blocks: Vec3) -> Vec3:
-    """Values of all bodies from those of the moving ones; 0 for the static ones."""
-    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
-    index = [block_of.get(body, len(block_of)) for body in range(scene.body_count)]
-    return take(blocks.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])), index)
 
 
 def _turns_matter(scene: Scene, model: Model) -> bool:
@@ -133,14 +126,10 @@ def matched_force(
       scene, close, contacts: static structure, and what is close in this step; all slots.
       force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
     """
-    previous = _previous_places(scene, close.found, pair)
-    parts, slot, place = [], scene.static_slot_count, 0
-    for group, p in zip(scene.compact_groups, close.groups, strict=True):
+    parts, slot = [], scene.static_slot_count
+    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
         rows = range(slot, slot + group.slot_count)
         old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
-        source = gather(previous, p.listed) - place
-        known = p.active & (source >= 0) & (source < group.place_count)
-        source = jnp.clip(source, 0, group.place_count - 1)
 
         def by_point(values: Array, count: int = group.point_count) -> Array:
             return values.reshape(-1, count, values.shape[-1])
@@ -148,8 +137,46 @@ def matched_force(
         old_feature = jnp.where(known[:, None], gather(by_point(old_feature), source), NO_PAIR)
         old_force = old_force.map(lambda x, f=by_point, s=source: gather(f(x), s))
         parts.append(matched_points(old_feature, by_point(new_feature), by_point(active), old_force))
-        slot, place = slot + group.slot_count, place + group.place_count
+        slot += group.slot_count
     return parts
+
+
+def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array) -> tuple[Array, Array]:
+    """Forces (slot, 3, world) and features (slot, world) of the last step in the slots where their pairs are now.
+
+    Args:
+      scene, close: static structure, and what is close in this step.
+      force, feature, pair: what the state keeps: (slot, 3, world), (slot, world) and (place, world).
+    """
+    own = range(scene.static_slot_count)
+    forces, features = [take(force, own)] if own else [], [take(feature, own)] if own else []
+    slot = scene.static_slot_count
+    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
+        points = jnp.arange(group.point_count, dtype=jnp.int32)[None, :, None]
+        slots = slot + source[:, None] * group.point_count + points
+        slots = slots.reshape(group.slot_count, -1)
+        known = jnp.repeat(known, group.point_count, axis=0)
+        forces.append(jnp.where(known[:, None], gather(force, slots), 0.0))
+        features.append(jnp.where(known, gather(feature, slots), NO_PAIR))
+        slot += group.slot_count
+    worlds = max(values.shape[-1] for values in (*forces, *features))
+
+    def join(parts: list[Array]) -> Array:
+        return jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in parts])
+
+    return join(forces), join(features)
+
+
+def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, Array]]:
+    """For each compact group, (place, world): its place that held the pair in the last step, and whether there was one."""
+    previous = _previous_places(scene, close.found, pair)
+    sources, first = [], 0
+    for group, p in zip(scene.compact_groups, close.groups, strict=True):
+        source = gather(previous, p.listed) - first
+        known = p.active & (source >= 0) & (source < group.place_count)
+        sources.append((jnp.clip(source, 0, group.place_count - 1), known))
+        first += group.place_count
+    return sources
 
 
 def _key(scene: Scene, first: Array, second: Array) -> Array:

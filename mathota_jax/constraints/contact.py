@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Inertia
-from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
     Side,
     collect,
@@ -26,21 +26,20 @@ from mathota_jax.constraints.assembly import (
     inner,
     pack_scalars,
     pack_sides,
-    push_out_speed,
     respond,
     select,
     select_blocks,
 )
+from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Places, Rows
-from mathota_jax.solver.soft_step import PositionError
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.indexing import take, unstack
-from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.safe import safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
+from mathota_jax.spatial.vector import Vec3, cross, dot, tangent_basis
 
 RELAXATION = 4 / 3
 """Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
@@ -65,6 +64,7 @@ class ContactRows(NamedTuple):
       directions: row directions in the world frame, components (turn * column, world).
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.
+      size: (turn, 1, column, world) inner radius of the smaller moving body.
     """
 
     rows: Rows
@@ -72,6 +72,7 @@ class ContactRows(NamedTuple):
     directions: tuple[Vec3, ...]
     separation: Array
     slop: Array
+    size: Array
 
 
 class PlacedPairs(NamedTuple):
@@ -107,6 +108,16 @@ def couples_rotation(scene: Scene) -> bool:
     return scene.friction or bool(scene.joints) or not kinds <= {"plane", "sphere"}
 
 
+def near_contacts(scene: Scene, model: Model, contacts: ContactSet) -> ContactSet:
+    """The contacts without those so far ahead that they are left to the search along the motion (`SPECULATIVE`)."""
+    sizes = [
+        jnp.where(np.asarray(scene.static)[np.asarray(side)][:, None], jnp.inf, take(model.size, side))
+        for side in scene.slot_bodies
+    ]
+    near = settle(jnp.where(contacts.separation <= SPECULATIVE * jnp.minimum(*sizes), 1.0, 0.0)) > 0.5
+    return contacts._replace(active=contacts.active & near)
+
+
 def contact_rows(
     scene: Scene,
     table: Table | TracedTable,
@@ -139,7 +150,12 @@ def contact_rows(
         start = start + inner(jacobian[0], select_blocks(table, side, motion.velocity, places))
         free = free + inner(jacobian[0], select_blocks(table, side, motion.free_velocity, places))
 
-    target, lever = _impact(scene, table, model, chosen, motion, start, free, pairs)
+    restitution = _pair_restitution(scene, table, model, pairs) if scene.restitution else None
+    approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
+    if scene.options.solver == "soft_step":
+        target, lever = rebound(approach, model.dt, model.dt * (1.0 + 1.0 / scene.options.substep_count))
+    else:
+        target, lever = impact(approach, model.dt)
     active = chosen.active.astype(normal.x.dtype)
     normal_mass = active / _row_bound(table, jacobians, responses, active, (0,))
     bias = [-target]
@@ -162,14 +178,15 @@ def contact_rows(
         table=table,
         places=places,
     )
-    slop = scene.options.slop * _smallest_size(scene, table, model, places)
+    size = pack_scalars(table, [_smallest_size(scene, table, model, places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     return ContactRows(
         rows,
         pack_scalars(table, [lever], worlds),
         directions,
         pack_scalars(table, [separation], worlds),
-        pack_scalars(table, [slop], worlds),
+        scene.options.slop * size,
+        size,
     )
 
 
@@ -241,95 +258,6 @@ def _push_only(effective_mass: Array) -> Bounded:
     )
 
 
-def _impact(
-    scene: Scene,
-    table: Table | TracedTable,
-    model: Model,
-    contacts: ContactSet,
-    motion: Motion,
-    start: Array,
-    free: Array,
-    pairs: PlacedPairs | None,
-) -> tuple[Array, Array]:
-    """Normal velocity to reach at the end of the step, and the lever of the impulse.
-
-    `start` and `free` are the normal velocities at the start and, unconstrained, at the end of the step. A contact *hits*
-    if it overlaps or if its present velocity closes the gap within the step; other gaps may close no further than to 0.
-    """
-    dt = model.dt
-    gap = jnp.maximum(contacts.separation, 0.0)
-    if scene.options.solver == "soft_step":
-        return _rebound(scene, table, model, gap, start, free, pairs)
-    hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(contacts.separation <= 0, 1.0, 0.0)) > 0
-    time = jnp.clip(jnp.where(hits & (start < 0), gap / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
-    # The gap changes by dt (start + end) / 2, so this end velocity closes it and no more.
-    target = jnp.where(hits, 0.0, -2.0 * gap / dt - start)
-    impact = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
-    # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
-    share = safe_divide(impact, impact + norm(motion.gravity) * dt)
-    lever = 0.5 * dt + share * (0.5 * dt - time)
-    if not scene.restitution:
-        return target, lever
-    acceleration = (free - start) / dt
-    bounce_velocity, bounce_time, bounces = _bounce(scene, table, model, gap, start, acceleration, dt, pairs)
-    return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
-
-
-def _rebound(
-    scene: Scene,
-    table: Table | TracedTable,
-    model: Model,
-    gap: Array,
-    start: Array,
-    free: Array,
-    pairs: PlacedPairs | None,
-) -> tuple[Array, Array]:
-    """The same for the small steps, which stop an approach at the surface before the restitution pass; 0 for no bounce.
-
-    The lever makes up for the flight after the impact: a body that left the surface with velocity u has moved by
-    ``u t + acceleration t^2 / 2`` and reached ``u + acceleration t``. It is bounded where that velocity is nearly lost.
-    """
-    if not scene.restitution:
-        return jnp.zeros(()), jnp.zeros(())
-    dt = model.dt
-    acceleration = (free - start) / dt
-    # An impact due just after the step may be met in it, by round-off or because of other contacts.
-    latest = dt * (1.0 + 1.0 / scene.options.substep_count)
-    velocity, time, bounces = _bounce(scene, table, model, gap, start, acceleration, latest, pairs)
-    flight = jnp.maximum(dt - time, 0.0)
-    leaving = velocity - acceleration * (dt - time)
-    velocity = jnp.maximum(leaving + acceleration * flight, 0.0)
-    mean = jnp.clip(safe_divide(leaving + 0.5 * acceleration * flight, velocity), 0.0, 2.0)
-    return jnp.where(bounces, velocity, 0.0), jnp.where(bounces, flight * mean, 0.0)
-
-
-def _bounce(
-    scene: Scene,
-    table: Table | TracedTable,
-    model: Model,
-    gap: Array,
-    start: Array,
-    acceleration: Array,
-    latest: Array,
-    pairs: PlacedPairs | None,
-) -> tuple[Array, Array, Array]:
-    """End velocity, time of impact and whether the contact bounces, for constant acceleration within the step.
-
-    The impact is the first root tau of ``gap + start t + acceleration t^2 / 2``. Forces act before and after it: a
-    contact bounces if it comes by the time `latest` and if, after it, the bodies still separate at the end of the step.
-    That is the only threshold.
-    """
-    dt = model.dt
-    discriminant = start * start - 2.0 * acceleration * gap
-    approach = safe_sqrt(jnp.maximum(discriminant, 0.0))  # speed at the impact
-    divisor = approach - start
-    time = safe_divide(2.0 * gap, divisor)
-    velocity = _pair_restitution(scene, table, model, pairs) * approach + acceleration * (dt - time)
-    reaches = (discriminant >= 0) & (divisor > 0) & (time <= latest) & ((start < 0) | (gap > 0))
-    bounces = settle(jnp.where(reaches & (velocity > 0), 1.0, 0.0)) > 0
-    return velocity, jnp.where(bounces, time, 0.0), bounces
-
-
 def _slot_bodies(scene: Scene, table: Table) -> tuple[np.ndarray, np.ndarray]:
     slots = np.maximum(table.order, 0)
     return tuple(np.asarray(side, np.int32)[slots] for side in scene.slot_bodies)  # type: ignore[return-value]
@@ -376,13 +304,6 @@ def _smallest_size(scene: Scene, table: Table | TracedTable, model: Model, place
     return smallest if sides == 1 else jnp.minimum(smallest, select_blocks(table, 1, sizes, places))
 
 
-def position_error(scene: Scene, contact: ContactRows, model: Model, worlds: int) -> PositionError:
-    """What the small steps need to know of the gaps and overlaps of one table."""
-    table = contact.rows.table
-    limit = pack_scalars(table, [push_out_speed(scene, table, model, contact.rows.places)], worlds)
-    return PositionError(contact.separation, limit, jnp.ones((1, 1, 1, 1), bool), contact.lever)
-
-
 def position_rows(contact: ContactRows, displacement: Array, percent: float) -> Rows:
     """Normal rows that move the bodies out of what remains of the overlap after the step (guide 10.2).
 
@@ -392,7 +313,11 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
       percent: share of the overlap beyond the slop that is corrected.
     """
     rows = contact.rows
-    error = contact.separation + displacement + contact.slop
+    # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never that
+    # the overlap went beyond the body's middle.
+    error = (
+        jnp.maximum(contact.separation + displacement, jnp.minimum(contact.separation, -contact.size)) + contact.slop
+    )
     mass = rows.law.normal_mass[:, None] if isinstance(rows.law, Cone) else rows.law.effective_mass
     return Rows(
         jacobian=tuple(side[:, :1] for side in rows.jacobian),

@@ -69,7 +69,8 @@ class Cone:
         free_2 = old_2 - error_2 * self.tangent_mass
         squared = free_1 * free_1 + free_2 * free_2
         limit = self.friction * normal
-        sliding = squared > limit * limit
+        # At the apex of the cone nothing sticks: a derivative must not see friction where nothing presses.
+        sliding = squared >= limit * limit
         scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
         return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
 

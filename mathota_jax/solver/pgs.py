@@ -279,6 +279,20 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses)
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
+    d_velocity, jacobians, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
+    d_impulses = _solve_linear(gradient_iterations, rows, jacobians, right_sides)
+    return (velocity, impulses), (add_impulses(rows, d_velocity, d_impulses), d_impulses)
+
+
+def linearise(
+    rows: tuple[Rows, ...], d_rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...], d_velocity: Array
+) -> tuple[Array, tuple[tuple[Array, Array], ...], tuple[Array, ...]]:
+    """Derivative of the fixed point of all laws, but for the change of the impulses.
+
+    Returns:
+      The change of the velocity at fixed impulses; for each group the Jacobians of its law with respect to impulse and
+      error, and the change of its impulses at fixed impulses.
+    """
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
         d_velocity = add_scaled(group, d_group.response, d_velocity, impulse)
     jacobians, right_sides = [], []
@@ -290,8 +304,7 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
         right_sides.append(
             jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023
         )
-    d_impulses = _solve_linear(gradient_iterations, rows, tuple(jacobians), tuple(right_sides))
-    return (velocity, impulses), (add_impulses(rows, d_velocity, d_impulses), d_impulses)
+    return d_velocity, tuple(jacobians), tuple(right_sides)
 
 
 def _solve_linear(

@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,15 +55,32 @@ MANIFOLD_PASSES = 3
 
 
 @pytree
+class ForceLaws:
+    """Rows of a group that obey a law of force: springs, dampers, friction, motors.
+
+    Their bias is that of a substep at the start of the step; bounds and softness are those of a substep, too.
+
+    Attributes:
+      acts: (turn, 1, column, 1) whether the row is one of them.
+      by_error, by_rate: (turn, 1, column, world) derivatives of the bias, which is linear in both.
+    """
+
+    acts: Array
+    by_error: Array
+    by_rate: Array
+
+
+@pytree
 class PositionError:
     """Position errors of the first row of each constraint of a group, (turn, 1, column, world).
 
     Attributes:
       start: at the start of the step; of a one-sided row it is a gap, negative where there is overlap.
-      limit: largest velocity of a correction; 0 for a row without a position error, which the first sweep leaves alone.
+      limit: largest velocity of a correction.
       one_sided: whether the row only pushes, (turn, 1, column, 1), or of size 1.
       lever: time [s] that the impulse of a bounce has to act on the position; None for joints.
       curvature: what the turning of the Jacobian adds to ``J v`` in half a step; None where it does not turn.
+      force: rows that obey a law of force instead; None without any.
     """
 
     start: Array
@@ -71,6 +88,7 @@ class PositionError:
     one_sided: Array
     lever: Array | None = None
     curvature: Array | None = None
+    force: ForceLaws | None = None
 
 
 @pytree
@@ -147,62 +165,80 @@ def solve(
       What the impulses add to the velocity at the end of the step and to the displacement (component, block, world), and
       the impulses of the whole step.
     """
+    if not rows:
+        return jnp.zeros_like(free), jnp.zeros_like(free), impulses
     length = dt / substeps
-    couplings = tuple(
-        None if error.lever is None else _coupling(group) for group, error in zip(rows, errors, strict=True)
+    groups = tuple(
+        _Group(
+            group,
+            error,
+            None if error.lever is None else _coupling(group),
+            pgs.row_velocity(group, velocity),
+            pgs.row_velocity(group, free - velocity) / dt,
+        )
+        for group, error in zip(rows, errors, strict=True)
     )
-    begin = tuple(pgs.row_velocity(group, velocity) for group in rows)
-    gain = tuple(pgs.row_velocity(group, free - velocity) / dt for group in rows)
-    added = pgs.add_impulses(rows, jnp.zeros_like(velocity), impulses)
 
     def substep(carry: tuple, number: Array) -> tuple[tuple, None]:
         """Carries what the impulses added to velocity and displacement: free bodies keep to their path exactly."""
-        velocity, change, displacement, impulses, total = carry
+        velocity, change, displacement, impulses, total, _ = carry
         start, half = velocity, 0.5 * change
         time, middle, end = number * length, (number + 0.5) * length, (number + 1.0) * length
         halves = tuple(0.5 * impulse for impulse in impulses)
-        biases, laws = [], []
         lasting = tuple(impulse[:, 0] > 0 for impulse in impulses)
-        for group, error, coupling, rate, acceleration, before in zip(
-            rows, errors, couplings, begin, gain, lasting, strict=True
-        ):
-            path = time * (rate + (0.5 * time) * acceleration)[:, :1]
-            correction = _correction(group, error, path, displacement, time, length, dt)
-            biases.append(correction + rate + middle * acceleration)
-            laws.append(_soft_law(group, error, coupling, before))
-        velocity, impulses = _sweep(1, rows, tuple(laws), tuple(biases), velocity + half, halves)
+        wanted = tuple(_law_bias(group, velocity, displacement, time, dt) for group in groups)
+        laws = tuple(_soft_law(group, before) for group, before in zip(groups, lasting, strict=True))
+        biases = tuple(
+            _correction(group, law_bias, velocity, displacement, time, length, dt) + group.free_rate(middle)
+            for group, law_bias in zip(groups, wanted, strict=True)
+        )
+        velocity, impulses = _sweep(1, rows, laws, biases, velocity + half, halves)
         displacement = displacement + length * velocity
         impulses = tuple(first + second for first, second in zip(impulses, halves, strict=True))
-        biases, laws = [], []
-        for group, error, coupling, rate, acceleration, impulse, before in zip(
-            rows, errors, couplings, begin, gain, impulses, lasting, strict=True
-        ):
-            biases.append(_drift(group, error, end, dt) + rate + end * acceleration)
-            laws.append(_rigid_law(group, coupling, impulse[:, :1] > 0, before))
-        velocity, impulses = _sweep(1, rows, tuple(laws), tuple(biases), velocity + half, impulses)
+        laws = tuple(
+            _rigid_law(group, impulse[:, :1] > 0, before)
+            for group, impulse, before in zip(groups, impulses, lasting, strict=True)
+        )
+        biases = _end_biases(groups, wanted, end, dt)
+        velocity, impulses = _sweep(1, rows, laws, biases, velocity + half, impulses)
         total = tuple(before + impulse for before, impulse in zip(total, impulses, strict=True))
         # What the impulses changed in this substep is what they would change in the next one.
-        return (velocity, velocity - start, displacement, impulses, total), None
+        return (velocity, velocity - start, displacement, impulses, total, wanted), None
 
     zero, none = jnp.zeros_like(velocity), tuple(jnp.zeros_like(impulse) for impulse in impulses)
-    carry = (zero, added, zero, impulses, none)
-    carry, _ = lax.scan(substep, carry, jnp.arange(substeps, dtype=velocity.dtype))
-    velocity, _, displacement, impulses, total = carry
+    added = pgs.add_impulses(rows, zero, impulses)
+    wanted = tuple(_law_bias(group, zero, zero, jnp.zeros_like(dt), dt) for group in groups)
+    carry = (zero, added, zero, impulses, none, wanted)
+    # In reverse mode a substep is computed again: only what it starts from is stored.
+    carry, _ = lax.scan(jax.checkpoint(substep, prevent_cse=False), carry, jnp.arange(substeps, dtype=velocity.dtype))
+    velocity, _, displacement, impulses, total, wanted = carry
     if not rebound_sweeps:
         return velocity, displacement, total
-    biases = [
-        _drift(group, error, dt, dt) + rate + dt * acceleration
-        for group, error, rate, acceleration in zip(rows, errors, begin, gain, strict=True)
-    ]
-    return _rebound(rebound_sweeps, rows, couplings, errors, biases, velocity, displacement, impulses, total)
+    biases = _end_biases(groups, wanted, dt, dt)
+    return _rebound(rebound_sweeps, groups, biases, velocity, displacement, impulses, total)
+
+
+class _Group(NamedTuple):
+    """Rows with their errors, the coupling of their manifolds (None for joints), and their motion without impulses.
+
+    Attributes:
+      begin, acceleration: (turn, row, column, world) rate at the start of the step and its change per time.
+    """
+
+    rows: Rows
+    error: PositionError
+    coupling: Array | None
+    begin: Array
+    acceleration: Array
+
+    def free_rate(self, time: Array) -> Array:
+        return self.begin + time * self.acceleration
 
 
 def _rebound(
     count: int,
-    rows: tuple[Rows, ...],
-    couplings: tuple[Array | None, ...],
-    errors: tuple[PositionError, ...],
-    biases: list[Array],
+    groups: tuple[_Group, ...],
+    biases: tuple[Array, ...],
     velocity: Array,
     displacement: Array,
     impulses: tuple[Array, ...],
@@ -213,16 +249,16 @@ def _rebound(
     The impulse acts since the time of the impact. So does the answer of the rows that do not bounce themselves, which is
     exact for one impact in a step and an approximation for several at different times.
     """
+    rows = tuple(group.rows for group in groups)
     laws, wanted, levers = [], [], []
-    for group, coupling, error, bias, impulse, sum_ in zip(
-        rows, couplings, errors, biases, impulses, total, strict=True
-    ):
+    for group, bias, impulse, sum_ in zip(groups, biases, impulses, total, strict=True):
         bounces, lever = jnp.zeros_like(impulse[:, :1], bool), jnp.zeros_like(impulse[:, :1])
-        if error.lever is not None:
-            bounces = (sum_[:, :1] > 0) & (group.bias[:, :1] < 0)
-            bias = bias + jnp.where(bounces, group.bias, 0.0)
-            lever = jnp.where(bounces, error.lever, 0.0)
-        laws.append(_rigid_law(group, coupling, (impulse[:, :1] > 0) | bounces, None))
+        if group.error.lever is not None:
+            asked = group.rows.bias[:, :1]
+            bounces = (sum_[:, :1] > 0) & (asked < 0)
+            bias = bias + jnp.where(bounces, group.rows.bias, 0.0)
+            lever = jnp.where(bounces, group.error.lever, 0.0)
+        laws.append(_rigid_law(group, (impulse[:, :1] > 0) | bounces, None))
         wanted.append(bias)
         levers.append((bounces, lever))
     longest = functools.reduce(jnp.maximum, [lever.max((0, 1, 2)) for _, lever in levers])
@@ -286,50 +322,97 @@ def _coupling(group: Rows) -> Array:
     return functools.reduce(jnp.add, [block(jacobian[:, 0], response[:, 0]) for jacobian, response in sides])
 
 
-def _soft_law(group: Rows, error: PositionError, coupling: Array | None, lasting: Array) -> Any:
+def _soft_law(group: _Group, lasting: Array) -> Any:
+    """Law of the first sweep, in which half of the impulse of a substep acts."""
+    coupling, law, force = group.coupling, group.rows.law, group.error.force
     if coupling is not None:
-        points = group.table.together
+        points = group.rows.table.together
         own = coupling.reshape(*coupling.shape[:2], -1, points, coupling.shape[-1])
         own = jnp.stack([own[:, p, :, p] for p in range(points)], axis=2)
-        return Manifold(group.law, coupling, own.reshape(coupling.shape[0], *coupling.shape[2:]) / HARDNESS, lasting)
-    law = group.law
+        return Manifold(law, coupling, own.reshape(coupling.shape[0], *coupling.shape[2:]) / HARDNESS, lasting)
     assert isinstance(law, Bounded)
-    own = safe_divide(jnp.ones_like(law.effective_mass), law.effective_mass) - law.softness
-    softness = own / HARDNESS
-    mass = jnp.where(error.limit > 0, OVER_RELAXATION * safe_divide(jnp.ones_like(own), own + softness), 0.0)
-    return dataclasses.replace(law, softness=softness, effective_mass=mass)
+    own = safe_divide(jnp.ones_like(law.effective_mass), law.effective_mass)
+    softness, mass = own / HARDNESS, law.effective_mass * (OVER_RELAXATION / (1.0 + 1.0 / HARDNESS))
+    if force is None:
+        return dataclasses.replace(law, softness=softness, effective_mass=mass)
+    return Bounded(
+        effective_mass=jnp.where(force.acts, law.effective_mass, mass),
+        softness=jnp.where(force.acts, law.softness, softness),
+        lower=0.5 * law.lower,
+        upper=0.5 * law.upper,
+    )
 
 
-def _rigid_law(group: Rows, coupling: Array | None, carries: Array, lasting: Array | None) -> Any:
+def _rigid_law(group: _Group, carries: Array, lasting: Array | None) -> Any:
     """Rows that only push and carry nothing stay open: what is still apart must not be stopped."""
-    law = group.law
+    coupling, law, force = group.coupling, group.rows.law, group.error.force
     if isinstance(law, Cone):
         assert coupling is not None
         closed = jnp.where(carries[:, 0], law.normal_mass, 0.0)
         return Manifold(dataclasses.replace(law, normal_mass=closed), coupling, None, lasting)
-    law = dataclasses.replace(law, effective_mass=jnp.where(carries | (law.lower < 0), law.effective_mass, 0.0))
+    closed = jnp.where(carries | (law.lower < 0), law.effective_mass, 0.0)
     if coupling is not None:
-        return Manifold(law, coupling, None, lasting)
-    return dataclasses.replace(law, effective_mass=OVER_RELAXATION * law.effective_mass)
+        return Manifold(dataclasses.replace(law, effective_mass=closed), coupling, None, lasting)
+    longer = OVER_RELAXATION * closed
+    mass = longer if force is None else jnp.where(force.acts, closed, longer)
+    return dataclasses.replace(law, effective_mass=mass)
+
+
+def _first_row(group: _Group, velocity: Array) -> Array:
+    """``J v`` of the first row of each constraint: (turn, 1, column, world)."""
+    rows = group.rows
+    return pgs.row_velocity(dataclasses.replace(rows, jacobian=tuple(side[:, :1] for side in rows.jacobian)), velocity)
+
+
+def _moved(group: _Group, displacement: Array, time: Array, dt: Array) -> Array:
+    """Change of the error of the first rows since the start of the step."""
+    path = time * group.free_rate(0.5 * time)[:, :1] + _first_row(group, displacement)
+    curvature = group.error.curvature
+    return path if curvature is None else path + curvature * (time * (time / dt - 1.0))
+
+
+def _law_bias(group: _Group, velocity: Array, displacement: Array, time: Array, dt: Array) -> Array | None:
+    """Bias that the laws of force ask for in the substep that starts at `time`; None where there are none."""
+    force, curvature = group.error.force, group.error.curvature
+    if force is None:
+        return None
+    gained = time * group.acceleration + _first_row(group, velocity)
+    if curvature is not None:
+        gained = gained + curvature * (2.0 * time / dt)
+    moved = _moved(group, displacement, time, dt)
+    return group.rows.bias + force.by_error * moved + force.by_rate * gained
 
 
 def _correction(
-    group: Rows, error: PositionError, path: Array, displacement: Array, time: Array, length: Array, dt: Array
+    group: _Group, law_bias: Array | None, velocity: Array, displacement: Array, time: Array, length: Array, dt: Array
 ) -> Array:
-    """Bias of the first sweep: closes gaps at most, and takes out a share of an overlap; `path` is that of free motion."""
-    first = dataclasses.replace(group, jacobian=tuple(side[:, :1] for side in group.jacobian))
-    now = error.start + path + pgs.row_velocity(first, displacement)
-    if error.curvature is not None:
-        now = now + error.curvature * (time * (time / dt - 1.0))
+    """Bias of the first sweep: closes gaps at most, and takes out a share of an overlap."""
+    error = group.error
+    now = error.start + _moved(group, displacement, time, dt)
     speed = jnp.clip(now * (SHARE / length), -error.limit, error.limit)
     speed = jnp.where(error.one_sided & (now > 0), now / length, speed)
-    if error.curvature is not None:
-        speed = speed + error.curvature * ((2.0 * time + length) / dt - 1.0)
-    return jnp.concatenate([speed, jnp.zeros_like(group.bias[:, 1:])], axis=1)
+    if law_bias is not None:
+        assert error.force is not None
+        # A law holds at the end, for the rate u_1 = 2 u - u_0 that belongs to the rate u in the middle.
+        rate = group.free_rate(time) + _first_row(group, velocity) + _drift(group, time, dt)
+        speed = jnp.where(error.force.acts, 0.5 * (law_bias - rate), speed)
+    speed = speed + _drift(group, time + 0.5 * length, dt)
+    return jnp.concatenate([speed, jnp.zeros_like(group.rows.bias[:, 1:])], axis=1)
 
 
-def _drift(group: Rows, error: PositionError, time: Array, dt: Array) -> Array:
-    """Bias of the relaxing sweep: none but that of a turning Jacobian, linear in time about the middle of the step."""
-    if error.curvature is None:
-        return jnp.zeros_like(group.bias)
-    return error.curvature * (2.0 * time / dt - 1.0)
+def _end_biases(groups: tuple[_Group, ...], wanted: tuple[Array | None, ...], time: Array, dt: Array) -> tuple:
+    """Biases of the sweep that relaxes the rows at `time`, the end of a substep."""
+    biases = []
+    for group, law_bias in zip(groups, wanted, strict=True):
+        bias = _drift(group, time, dt) + group.free_rate(time)
+        if law_bias is not None:
+            assert group.error.force is not None
+            bias = bias + jnp.where(group.error.force.acts, law_bias, 0.0)
+        biases.append(bias)
+    return tuple(biases)
+
+
+def _drift(group: _Group, time: Array, dt: Array) -> Array:
+    """What the turning of a Jacobian adds to the rate: linear in time about the middle of the step."""
+    curvature = group.error.curvature
+    return jnp.zeros((), group.rows.bias.dtype) if curvature is None else curvature * (2.0 * time / dt - 1.0)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot
 
@@ -73,3 +74,14 @@ def exponential(rotation_vector: Vec3) -> Quaternion:
     # Each serves several components; trigonometry is worth doing once.
     scale, cosine = compute_once((0.5 * sinc, cosine), quarter)
     return Quaternion(cosine, rotation_vector.x * scale, rotation_vector.y * scale, rotation_vector.z * scale)
+
+
+def logarithm(q: Quaternion) -> Vec3:
+    """Rotation vector of a unit quaternion, the short way round; smooth at no rotation."""
+    sign = jnp.where(q.w < 0, -1.0, 1.0)
+    axis = Vec3(q.x * sign, q.y * sign, q.z * sign)
+    sine = safe_sqrt(dot(axis, axis))
+    # Below, the quotient is 2 to the round-off of either precision.
+    small = sine < jnp.sqrt(jnp.finfo(sine.dtype).eps)
+    angle = 2.0 * jnp.arctan2(jnp.where(small, 1.0, sine), q.w * sign)
+    return axis * jnp.where(small, 2.0, safe_divide(angle, jnp.where(small, 1.0, sine)))

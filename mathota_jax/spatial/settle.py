@@ -68,9 +68,10 @@ def materialize(values: Any) -> Any:
     2 or 3 modulo 4; its other branch returns every array in the place of another, or JAX would forward them unstored.
 
     Args:
-        values: Pytree of at least two finite arrays, all of the same shape.
+        values: Pytree of at least two finite arrays, all of the same shape but for the number of worlds.
     """
     leaves, tree = jax.tree.flatten(values)
+    leaves = jnp.broadcast_arrays(*leaves)
     bits = lax.bitcast_convert_type(leaves[0].reshape(-1)[0].astype(jnp.float32), jnp.int32)
     always = ((bits * bits) & 3) < 2
     stored = lax.cond(always, lambda *x: x, lambda first, *rest: (*rest, first), *leaves)

@@ -53,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.only:
         print(f"{name} ...", flush=True)
         report["measurements"][name] = _measure(name, settings)
-    write(report, output)
+        write(report, output)  # what is measured is kept, should the run be broken off
     print(markdown(report))
     return int(any("failed" in result for result in report["measurements"].values()))
 

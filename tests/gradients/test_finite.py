@@ -53,7 +53,7 @@ def placements():
     ("restitution", "double"),
     [
         (0.5, False),
-        (0.0, True),
+        pytest.param(0.0, True, marks=pytest.mark.slow),
         pytest.param(0.0, False, marks=pytest.mark.slow),
         pytest.param(0.5, True, marks=pytest.mark.slow),
     ],

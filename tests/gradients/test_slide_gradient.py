@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import rollout
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import GRAVITY, slab_on_plane, undamped
 
 SPEED, FRICTION = 2.0, 0.4
@@ -50,6 +51,7 @@ def check(gate, what, measured, truth, limit, scale=None):
         gate(f"d {what} / d {name} against {value:.6g}", (float(measured[name]) - value) / size, limit)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_while_sliding(precision, gate):
     (_, speed), (position_slopes, velocity_slopes) = slide(time := 0.25)
     gate("speed [m/s]", speed - (SPEED - FRICTION * GRAVITY * time), 1e-3)
@@ -63,6 +65,7 @@ def test_while_sliding(precision, gate):
     gate("d v / d mass", velocity_slopes["mass"], {"float32": 1e-5, "float64": 1e-6}[str(precision)])
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_after_stopping(precision, gate):
     (position, speed), (position_slopes, velocity_slopes) = slide(0.75)
     distance = SPEED**2 / (2 * FRICTION * GRAVITY)

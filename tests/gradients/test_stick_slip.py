@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import apply_force, step
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import GRAVITY, slab_on_plane, undamped
 
 FRICTION = 0.4
@@ -44,6 +45,7 @@ def pushed(factors):
 FACTORS = (0.0, 0.5, 0.9, 0.99, 1.0, 1.01, 1.1, 6.0 / THRESHOLD, 3.0)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_both_sides_of_the_threshold(precision, gate):
     factors = np.array(FACTORS)
     force, velocity, by_force, by_friction = pushed(factors)

@@ -1,7 +1,6 @@
 """Compounds and off-centre polyhedra in free flight: conservation, and the same body described in another way."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +22,10 @@ from mathota_jax import (
     energy,
     rollout,
 )
+from tests.hulls import BOX_CORNERS
 from tests.scenes import angle_between, record_worlds, repeat, undamped
 
 UNIT = (1.0, 0.0, 0.0, 0.0)
-CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 WEDGE = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.7], [2, 0, 0.7], [0, 1, 0.7]]) + np.array([3, -1, 2])
 TURN = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_quat()[[3, 0, 1, 2]]
 START = Rotation.from_rotvec([-0.4, 0.1, 1.2])
@@ -80,9 +79,9 @@ def test_angular_momentum_is_conserved(name, precision, gate):
 OTHER = Rotation.from_quat(TURN[[1, 2, 3, 0]])
 # The same solid as Box(HALF): (shape, orientation of its frame seen from that of the box, centre of mass in its frame)
 TWINS = {
-    "points": (Polyhedron(CORNERS * HALF), Rotation.identity(), np.zeros(3)),
-    "points elsewhere": (Polyhedron(CORNERS * HALF + [3, 4, 5]), Rotation.identity(), np.array([3.0, 4.0, 5.0])),
-    "turned points": (Polyhedron((CORNERS * HALF) @ OTHER.as_matrix().T + 1.0), OTHER, np.ones(3)),
+    "points": (Polyhedron(BOX_CORNERS * HALF), Rotation.identity(), np.zeros(3)),
+    "points elsewhere": (Polyhedron(BOX_CORNERS * HALF + [3, 4, 5]), Rotation.identity(), np.array([3.0, 4.0, 5.0])),
+    "turned points": (Polyhedron((BOX_CORNERS * HALF) @ OTHER.as_matrix().T + 1.0), OTHER, np.ones(3)),
     "turned part": (Compound([(Box(HALF), ((1, 0, 0), TURN))]), OTHER, np.array([1.0, 0.0, 0.0])),
     "two halves": (
         Compound([(Box(HALF * [1, 0.5, 1]), ((0, y, 0), UNIT)) for y in (-0.15, 0.15)]),

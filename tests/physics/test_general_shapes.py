@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Cone, Cylinder, Plane, Polyhedron, SceneBuilder, rollout
+from tests.hulls import BOX_CORNERS
 from tests.scenes import DOWN, undamped
 
 DT = 1 / 240
-CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 LYING = (np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0)  # the axis along z
 
 
@@ -43,7 +43,7 @@ def test_cylinder_rolls_down_a_slope(precision, gate):
 def test_cube_as_polyhedron_slides_like_the_box(precision, gate):
     """The same cube in two descriptions; v^2 / (2 mu g) in both."""
     finals = []
-    for shape in (Box((0.1, 0.1, 0.1)), Polyhedron(0.1 * CORNERS)):
+    for shape in (Box((0.1, 0.1, 0.1)), Polyhedron(0.1 * BOX_CORNERS)):
         model, state = on_plane(shape, height=0.1, velocity=(2, 0, 0), friction=0.4)
         finals.append(run(model, state, 240)[0])
     gate("distance / truth - 1", finals[1].position[1, 0] / (4 / (2 * 0.4 * 9.81)) - 1, 1e-3)
@@ -52,7 +52,7 @@ def test_cube_as_polyhedron_slides_like_the_box(precision, gate):
 
 @pytest.mark.parametrize(
     ("shape", "height"),
-    [(Cylinder(0.1, 0.1), 0.1), (Cone(0.1, 0.1), 0.05), (Polyhedron(0.1 * CORNERS), 0.1)],
+    [(Cylinder(0.1, 0.1), 0.1), (Cone(0.1, 0.1), 0.05), (Polyhedron(0.1 * BOX_CORNERS), 0.1)],
     ids=["cylinder", "cone", "polyhedron"],
 )
 def test_stands_on_a_plane(precision, shape, height, gate):
@@ -67,10 +67,10 @@ def test_stands_on_a_plane(precision, shape, height, gate):
 def test_stands_on_another_one(upper, gate):
     """On a polyhedral plate, by the general manifold: neither tips over nor sinks."""
     shapes = {"cylinder": (Cylinder(0.1, 0.1), 0.1), "cone": (Cone(0.1, 0.1), 0.05),
-              "polyhedron": (Polyhedron(0.1 * CORNERS), 0.1)}  # fmt: skip
+              "polyhedron": (Polyhedron(0.1 * BOX_CORNERS), 0.1)}  # fmt: skip
     shape, height = shapes[upper]
     builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Polyhedron(CORNERS * [0.5, 0.1, 0.5]), static=True, position=(0, -0.1, 0))
+    builder.add_body(Polyhedron(BOX_CORNERS * [0.5, 0.1, 0.5]), static=True, position=(0, -0.1, 0))
     builder.add_body(shape, mass=1.0, position=(0.03, height, 0.02))
     model, state = builder.build(undamped(dt=DT))
     final, _ = run(model, state, 480)
@@ -82,7 +82,7 @@ def test_stands_on_another_one(upper, gate):
 def test_gradient_of_the_slide_of_a_polyhedron(float64, gate):
     """d distance / d friction = -g t^2 / 2 while it slides, by a polyhedron that rests on its vertices."""
     steps = 100
-    model, state = on_plane(Polyhedron(0.1 * CORNERS), height=0.1, velocity=(2, 0, 0), friction=0.4)
+    model, state = on_plane(Polyhedron(0.1 * BOX_CORNERS), height=0.1, velocity=(2, 0, 0), friction=0.4)
 
     def distance(friction):
         changed = dataclasses.replace(model, friction=jnp.full(2, friction))

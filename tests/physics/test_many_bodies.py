@@ -54,7 +54,7 @@ def settled(method, shape):
     return model, advance(model, state, 80)
 
 
-@pytest.mark.parametrize("method", ["all_pairs", "grid"])
+@pytest.mark.parametrize("method", ["grid", pytest.param("all_pairs", marks=pytest.mark.slow)])
 def test_same_trajectory_as_with_a_slot_for_every_pair(method, float64, gate):
     """Both solve the same equations to convergence; they differ in the order of the rows only."""
     own_model, own = settled("none", "spheres")
@@ -83,6 +83,7 @@ def test_same_contacts_of_boxes(float64, gate):
         np.testing.assert_allclose(found[pair], separations, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_same_gradient_as_with_a_slot_for_every_pair(float64, gate):
     """Through a broadphase, a colouring and a solver with traced indices, in reverse mode and in forward mode."""
 
@@ -221,6 +222,7 @@ def test_hub_with_many_neighbours(gate):
     gate("overlap / radius", np.maximum(1.1 - distance, 0) / RADIUS, 0.02)
 
 
+@pytest.mark.slow
 def test_kinds_share_a_broadphase(gate):
     """Spheres, capsules and boxes, jointed bodies left out: three kinds, six groups, each with its own places."""
     builder = SceneBuilder(gravity=(0.0, -GRAVITY, 0.0))

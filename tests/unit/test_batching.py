@@ -127,6 +127,7 @@ def test_gradients(float64, name):
     np.testing.assert_allclose(measured, loop(jax.grad(cost), batch), rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_hessian(float64):
     batch = parameters()
     measured = np.asarray(jax.jit(jax.vmap(jax.hessian(cost)))(batch))

@@ -1,7 +1,6 @@
 """Bodies whose centre of mass is not the origin of their shape, or whose principal axes are not its axes."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +25,10 @@ from mathota_jax import (
 from mathota_jax.bodies import unpack
 from mathota_jax.collision.placement import shape_parameters, shape_poses
 from mathota_jax.geometry.bounds import aabb
+from tests.hulls import BOX_CORNERS
 from tests.scenes import rotation_matrix, undamped
 
 UNIT = (1.0, 0.0, 0.0, 0.0)
-CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 WEDGE = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0, 0, 0.7], [2, 0, 0.7], [0, 1, 0.7]])
 
 
@@ -83,7 +82,7 @@ def test_what_no_body_needs_is_absent():
     for shape in (
         Box((1, 2, 3)),
         Cylinder(1.0, 2.0),
-        Polyhedron(CORNERS * [1, 2, 3] + [7, 0, 0]),
+        Polyhedron(BOX_CORNERS * [1, 2, 3] + [7, 0, 0]),
         Compound([(Box((1, 2, 3)), ((0, 0, 0), UNIT))]),
         Compound([(Sphere(1.0), ((4, 5, 6), TURN))]),  # around its centre of mass the sphere is at the origin
     ):
@@ -93,7 +92,7 @@ def test_what_no_body_needs_is_absent():
 
 
 def test_a_cube_of_points_is_spherical():
-    model, _, _ = single(Polyhedron(CORNERS))
+    model, _, _ = single(Polyhedron(BOX_CORNERS))
     assert model.scene.spherical == (True,)
 
 
@@ -166,7 +165,7 @@ def test_pairs_without_a_function_are_a_clear_error():
 
 def test_polyhedra_of_different_size_share_one_array():
     builder = SceneBuilder()
-    builder.add_body(Polyhedron(CORNERS), mass=1.0, collides=False)
+    builder.add_body(Polyhedron(BOX_CORNERS), mass=1.0, collides=False)
     builder.add_body(Polyhedron(WEDGE), mass=1.0, collides=False)
     model, _ = builder.build()
     vertices = np.asarray(model.shapes["polyhedron"]["vertices"])
@@ -178,7 +177,7 @@ def test_polyhedra_of_different_size_share_one_array():
 
 def test_placed_shapes_have_the_layout_of_pair_functions(float64):
     """Vertices first, faces alike; every face of every pair outside of its polyhedron; bounds around the corners."""
-    wedge, cube = Polyhedron(WEDGE), Polyhedron(CORNERS)
+    wedge, cube = Polyhedron(WEDGE), Polyhedron(BOX_CORNERS)
     builder = SceneBuilder()
     hills = Heightfield(np.arange(12.0).reshape(3, 4), 0.5)
     builder.add_body(hills, static=True, collides=False)

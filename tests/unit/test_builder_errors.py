@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from mathota_jax import (
+    BallAndSocket,
     Box,
     Capsule,
+    Distance,
+    Fixed,
     Hinge,
     Options,
     Plane,
@@ -43,6 +46,16 @@ def motor(joint=None, **arguments):
     builder = bodies()
     hinge = builder.add_joint(Hinge(parent=0, child=1, anchor=(0, 1, 0), axis=(0, 0, 1)), name="latch")
     builder.add_motor(hinge if joint is None else joint, **arguments)
+
+
+def link(kind, **arguments):
+    builder = bodies()
+    return builder, builder.add_joint(kind(**{"parent": 0, "child": 1, "anchor": (0, 2, 0), **arguments}), name="tie")
+
+
+def drive(joint_kind, joint, **arguments):
+    builder, handle = link(joint_kind, **joint)
+    builder.add_motor(handle, **arguments)
 
 
 def built(motors=1):
@@ -143,7 +156,46 @@ BAD = {
     "damping, NaN": (lambda: join(Slider, damping=NAN), ["damping"]),
     "joint of another kind": (lambda: bodies().add_joint("hinge"), ["joint"]),
     "joint name used twice": (repeated_joint_name, ["latch", "name"]),
+    "friction of a joint, negative": (lambda: join(friction=-0.1), ["joint0", "friction"]),
+    "friction of a joint, NaN": (lambda: link(BallAndSocket, friction=NAN), ["tie", "friction"]),
+    "stiffness, negative": (lambda: join(stiffness=-0.1), ["joint0", "stiffness"]),
+    "stiffness, infinite": (lambda: link(Distance, lengths=(0, 2), stiffness=INFINITY), ["tie", "stiffness"]),
+    "rest, NaN": (lambda: join(stiffness=1.0, rest=NAN), ["rest"]),
+    "rest of a spring, text": (lambda: link(Distance, lengths=(0, 2), rest="long"), ["tie", "rest"]),
+    "armature, negative": (lambda: join(Slider, armature=-1.0), ["armature"]),
+    "damping of a ball, negative": (lambda: link(BallAndSocket, damping=-1.0), ["tie", "damping"]),
+    "limits beyond a turn": (lambda: join(limits=(-4.0, 1.0)), ["limits", "pi"]),
+    "limits equal, with friction": (lambda: join(limits=(0.5, 0.5), friction=1.0), ["friction", "limits"]),
+    "swing, negative": (lambda: link(BallAndSocket, axis=(0, 1, 0), swing=-0.1), ["tie", "swing"]),
+    "swing beyond half a turn": (lambda: link(BallAndSocket, axis=(0, 1, 0), swing=3.2), ["tie", "swing"]),
+    "swing without axis": (lambda: link(BallAndSocket, swing=0.5), ["tie", "swing", "axis"]),
+    "twist without axis": (lambda: link(BallAndSocket, twist=(-1, 1)), ["tie", "twist", "axis"]),
+    "twist reversed": (lambda: link(BallAndSocket, axis=(0, 1, 0), twist=(1, -1)), ["tie", "twist", "swap"]),
+    "axis of a ball, zero": (lambda: link(BallAndSocket, axis=(0, 0, 0), swing=0.5), ["tie", "axis"]),
+    "anchor of a ball, two points": (lambda: link(BallAndSocket, anchor=((0, 1, 0), (0, 2, 0))), ["tie", "anchor"]),
+    "anchor of a ball, none": (lambda: link(BallAndSocket, anchor=None), ["tie", "anchor"]),
+    "anchor of a weld, NaN": (lambda: link(Fixed, anchor=(0, NAN, 0)), ["tie", "anchor"]),
+    "anchor of a rod, none": (lambda: link(Distance, anchor=None), ["tie", "anchor"]),
+    "child anchor of a rod, two components": (lambda: link(Distance, child_anchor=(0, 1)), ["tie", "child_anchor"]),
+    "rod between equal points": (lambda: link(Distance, anchor=(0, 1, 0)), ["tie", "length", "BallAndSocket"]),
+    "lengths reversed": (lambda: link(Distance, lengths=(2.0, 1.0)), ["tie", "lengths", "swap"]),
+    "lengths negative": (lambda: link(Distance, lengths=(-1.0, 1.0)), ["tie", "lengths", "negative"]),
+    "length zero": (lambda: link(Distance, lengths=0.0), ["tie", "length"]),
+    "length NaN": (lambda: link(Distance, lengths=NAN), ["tie", "lengths"]),
+    "rod with a spring": (lambda: link(Distance, stiffness=1.0), ["tie", "stiffness", "limits"]),
     # motors
+    "motor on a ball": (lambda: drive(BallAndSocket, {}), ["tie", "BallAndSocket", "driven"]),
+    "motor on a weld": (lambda: drive(Fixed, {}), ["tie", "Fixed", "driven"]),
+    "motor on a rod": (lambda: drive(Distance, {}), ["tie", "Distance", "driven"]),
+    "cap, negative": (lambda: motor(kind="velocity", cap=-1.0), ["cap"]),
+    "cap, zero": (lambda: motor(kind="velocity", cap=0.0), ["cap"]),
+    "cap, NaN": (lambda: motor(kind="position", stiffness=1.0, cap=NAN), ["cap"]),
+    "cap of a torque motor": (lambda: motor(cap=1.0), ["cap", "velocity", "position"]),
+    "position motor without stiffness": (lambda: motor(kind="position"), ["stiffness"]),
+    "stiffness of a motor, negative": (lambda: motor(kind="position", stiffness=-1.0), ["stiffness"]),
+    "damping of a motor, negative": (lambda: motor(kind="position", stiffness=1.0, damping=-1.0), ["damping"]),
+    "stiffness of a torque motor": (lambda: motor(stiffness=1.0), ["stiffness", "position"]),
+    "damping of a velocity motor": (lambda: motor(kind="velocity", damping=1.0), ["damping", "position"]),
     "joint out of range": (lambda: motor(joint=5), ["joint", "5"]),
     "joint of an unknown name": (lambda: motor(joint="knee"), ["joint", "knee"]),
     "kind unknown": (lambda: motor(kind="steam"), ["kind", "steam", "torque"]),

@@ -20,7 +20,7 @@ from mathota_jax.collision.pairs.sphere_polyhedron import sphere_polyhedron
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
-from tests.hulls import hull, point_to_hull
+from tests.hulls import BOX_CORNERS, hull, point_to_hull
 
 FUNCTIONS = {
     ("plane", "cylinder"): plane_cylinder,
@@ -35,7 +35,6 @@ FUNCTIONS = {
 PAIRS = [pair for pair in FUNCTIONS if pair[1] != "box"]
 IDS = ["_".join(pair) for pair in PAIRS]
 COUNT = 256
-BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
 # ---- scenes: one pair, one pose a row; polyhedra share their vertices between the rows -----------------------------

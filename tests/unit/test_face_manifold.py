@@ -17,10 +17,9 @@ from mathota_jax.collision.pairs.convex import convex_pair, convex_point_count
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
-from tests.hulls import hull, point_to_hull
+from tests.hulls import BOX_CORNERS, hull, point_to_hull
 
 COUNT = 64
-BOX_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 HEXAGON = np.array([[np.cos(a), y, np.sin(a)] for a in np.arange(6) * np.pi / 3 + 0.2 for y in (-1, 1)]) * 0.5
 KINDS = ("capsule", "box", "cylinder", "cone", "polyhedron")
 

@@ -26,8 +26,8 @@ from mathota_jax.geometry.mass import combine, mass_properties
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3
+from tests.hulls import BOX_CORNERS
 
-CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 PRISM = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0.5, 1.6, 0], [0, 1, 0]])  # a house, 5 corners
 PRISM = np.concatenate([PRISM, PRISM + np.array([0.2, 0.1, 0.7])])
 CLOUD = np.random.default_rng(3).normal(size=(40, 3)) * [1.0, 0.4, 0.2] + [2.0, -1.0, 0.5]
@@ -50,7 +50,7 @@ SOLIDS = {
     "flat cone": Cone(2.0, 0.2),
     "rod": Cylinder(0.01, 1.0),
     "cloud": Polyhedron(CLOUD),
-    "plate": Polyhedron(CORNERS * [1.0, 1e-3, 1.0]),
+    "plate": Polyhedron(BOX_CORNERS * [1.0, 1e-3, 1.0]),
     "hammer": Compound([(Cylinder(0.1, 0.6), ((0, 0, 0), QUARTER)), (Box((0.2, 0.3, 0.2)), ((0.8, 0.1, 0), TURN))]),
     "mixed": Compound(
         [
@@ -71,7 +71,7 @@ def nodes(shape):
         turned = [Rotation.from_quat(part.orientation[[1, 2, 3, 0]]).apply(p) + part.position for part, p, _ in parts]
         return np.concatenate(turned), np.concatenate([weights for *_, weights in parts])
     if isinstance(shape, Box):
-        return CORNERS / np.sqrt(3) * shape.half_extents, np.full(8, np.prod(shape.half_extents))
+        return BOX_CORNERS / np.sqrt(3) * shape.half_extents, np.full(8, np.prod(shape.half_extents))
     if isinstance(shape, Polyhedron):
         # Tetrahedra of a Delaunay triangulation, each with the four-point rule of degree 2.
         tetrahedra = shape.vertices[Delaunay(shape.vertices).simplices]
@@ -119,7 +119,7 @@ def surface(shape, count=400):
     """Dense points (n, 3) of the surface, extreme points included as far as the grid has them."""
     angle = np.linspace(0, 2 * np.pi, 2 * count, endpoint=False)
     if isinstance(shape, Box):
-        return CORNERS * shape.half_extents
+        return BOX_CORNERS * shape.half_extents
     if isinstance(shape, Polyhedron):
         return shape.vertices
     if isinstance(shape, Heightfield):
@@ -171,7 +171,7 @@ def test_mass_properties_match_quadrature(name):
 
 def test_polyhedra_agree_with_trimesh():
     trimesh = pytest.importorskip("trimesh")
-    for points in (PRISM, CLOUD, CORNERS * [1, 2, 3] + 10):
+    for points in (PRISM, CLOUD, BOX_CORNERS * [1, 2, 3] + 10):
         shape, mesh = Polyhedron(points), trimesh.Trimesh(points).convex_hull
         mesh.density = 1.0 / mesh.volume
         np.testing.assert_allclose(shape.volume(), mesh.volume, rtol=1e-10)
@@ -191,7 +191,7 @@ def test_capsule_tends_to_sphere_and_to_rod():
 
 def test_box_as_polyhedron_is_the_box():
     box = Box((0.2, 0.5, 1.1))
-    hull = Polyhedron(CORNERS * box.half_extents)
+    hull = Polyhedron(BOX_CORNERS * box.half_extents)
     assert len(hull.faces) == 6
     np.testing.assert_allclose(hull.unit_inertia(), box.unit_inertia(), rtol=1e-13)
     assert hull.bounding_radius() == pytest.approx(box.bounding_radius(), rel=1e-14)
@@ -234,12 +234,12 @@ def test_plane_normalises():
 # ---- hulls -----------------------------------------------------------------------------------------------------------
 
 HULLS = {
-    "cube": (CORNERS, 8, 6),
+    "cube": (BOX_CORNERS, 8, 6),
     "cube of many points": (np.array(list(itertools.product(np.linspace(-1, 1, 5), repeat=3))), 8, 6),
     "prism": (PRISM, 10, 7),
     "tetrahedron": (np.eye(4)[:, :3], 4, 4),
-    "plate": (CORNERS * [1, 1e-3, 1], 8, 6),
-    "needle": (CORNERS * [1e-3, 1, 1e-3], 8, 6),
+    "plate": (BOX_CORNERS * [1, 1e-3, 1], 8, 6),
+    "needle": (BOX_CORNERS * [1e-3, 1, 1e-3], 8, 6),
     "sphere of 64": (np.random.default_rng(0).normal(size=(64, 3)), 64, 124),
 }
 
@@ -269,8 +269,8 @@ def test_hull_faces_are_whole_and_turn_outwards(name, scale, turned):
 
 
 def test_hull_keeps_the_order_and_the_values_of_the_points():
-    points = np.concatenate([np.zeros((1, 3)), CORNERS, CORNERS[::-1] * 0.5])
-    np.testing.assert_array_equal(Polyhedron(points).vertices, CORNERS)
+    points = np.concatenate([np.zeros((1, 3)), BOX_CORNERS, BOX_CORNERS[::-1] * 0.5])
+    np.testing.assert_array_equal(Polyhedron(points).vertices, BOX_CORNERS)
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
@@ -475,13 +475,16 @@ UNIT = (1, 0, 0, 0)
         (lambda: Plane((0.0, 1.0)), r"Plane\.normal"),
         (lambda: Plane((0.0, 1.0, 0.0), float("inf")), r"Plane\.offset must be a finite number"),
         (lambda: Polyhedron(np.zeros((8, 3))), r"Polyhedron\.points must hold at least 4 different .* add points"),
-        (lambda: Polyhedron(CORNERS[:3]), r"Polyhedron\.points must hold at least 4 different points, got 3"),
-        (lambda: Polyhedron(CORNERS[[0, 1, 2, 2]]), r"Polyhedron\.points must hold at least 4 different points, got 3"),
-        (lambda: Polyhedron(CORNERS[:4]), r"Polyhedron\.points must span a volume.*thickness"),
-        (lambda: Polyhedron(CORNERS * [1, 1, 1e-9]), r"Polyhedron\.points must span a volume"),
+        (lambda: Polyhedron(BOX_CORNERS[:3]), r"Polyhedron\.points must hold at least 4 different points, got 3"),
+        (
+            lambda: Polyhedron(BOX_CORNERS[[0, 1, 2, 2]]),
+            r"Polyhedron\.points must hold at least 4 different points, got 3",
+        ),
+        (lambda: Polyhedron(BOX_CORNERS[:4]), r"Polyhedron\.points must span a volume.*thickness"),
+        (lambda: Polyhedron(BOX_CORNERS * [1, 1, 1e-9]), r"Polyhedron\.points must span a volume"),
         (lambda: Polyhedron(np.outer(np.arange(6.0), [1, 2, 3])), r"Polyhedron\.points must span a volume"),
-        (lambda: Polyhedron(CORNERS * [1, np.nan, 1]), r"Polyhedron\.points must be finite, got nan at \(0, 1\)"),
-        (lambda: Polyhedron(CORNERS.T), r"Polyhedron\.points must have shape \(points, 3\), got \(3, 8\)"),
+        (lambda: Polyhedron(BOX_CORNERS * [1, np.nan, 1]), r"Polyhedron\.points must be finite, got nan at \(0, 1\)"),
+        (lambda: Polyhedron(BOX_CORNERS.T), r"Polyhedron\.points must have shape \(points, 3\), got \(3, 8\)"),
         (lambda: Polyhedron([]), r"Polyhedron\.points must have shape"),
         (lambda: Polyhedron("cube"), r"Polyhedron\.points must be numeric"),
         (lambda: Polyhedron(surface(Sphere(1.0), 12)), r"Polyhedron\.points .* at most 64 .* simplify"),
@@ -507,7 +510,7 @@ def test_bad_arguments_are_named(build, message):
 
 
 def test_shapes_do_not_alias_the_callers_array():
-    half, points, heights = np.array([1.0, 2.0, 3.0]), CORNERS.copy(), np.zeros((3, 3))
+    half, points, heights = np.array([1.0, 2.0, 3.0]), BOX_CORNERS.copy(), np.zeros((3, 3))
     for array, shape, name in (
         (half, Box(half), "half_extents"),
         (points, Polyhedron(points), "vertices"),

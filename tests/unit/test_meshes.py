@@ -1,6 +1,5 @@
 """Mesh files: hulls, convex decompositions and their cache. Runs only with the extra `io`."""
 
-import itertools
 import sys
 
 import numpy as np
@@ -10,8 +9,8 @@ from scipy.spatial import ConvexHull
 from mathota_jax import Polyhedron, SceneBuilder, step
 from mathota_jax.io import load_convex_parts, load_mesh, simplified_hull
 from mathota_jax.io import meshes as module
+from tests.hulls import BOX_CORNERS
 
-CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 BALL = np.random.default_rng(0).normal(size=(2000, 3))
 BALL /= np.linalg.norm(BALL, axis=1, keepdims=True)
 
@@ -19,8 +18,8 @@ BALL /= np.linalg.norm(BALL, axis=1, keepdims=True)
 
 
 def test_a_hull_of_few_corners_is_kept_whole():
-    points = np.concatenate([CORNERS, 0.5 * CORNERS])
-    np.testing.assert_array_equal(np.unique(simplified_hull(points), axis=0), np.unique(CORNERS, axis=0))
+    points = np.concatenate([BOX_CORNERS, 0.5 * BOX_CORNERS])
+    np.testing.assert_array_equal(np.unique(simplified_hull(points), axis=0), np.unique(BOX_CORNERS, axis=0))
 
 
 def test_a_hull_of_many_corners_is_thinned_out_evenly():
@@ -37,12 +36,12 @@ def test_a_hull_of_many_corners_is_thinned_out_evenly():
 @pytest.mark.parametrize("limit", [3, 65, 8.0, "many"])
 def test_vertex_limit_is_checked(limit):
     with pytest.raises(ValueError, match="vertex_limit must be a whole number from 4 to 64"):
-        simplified_hull(CORNERS, limit)
+        simplified_hull(BOX_CORNERS, limit)
 
 
 def test_degenerate_points_are_left_to_polyhedron():
     with pytest.raises(ValueError, match=r"Polyhedron\.points must span a volume"):
-        Polyhedron(simplified_hull(CORNERS[:4]))
+        Polyhedron(simplified_hull(BOX_CORNERS[:4]))
 
 
 @pytest.mark.parametrize("load", [load_mesh, load_convex_parts])

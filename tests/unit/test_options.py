@@ -51,10 +51,11 @@ def test_bad_broadphase_is_refused(name, value):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"solver": "xpbd"}, "Options.solver must be one of 'pgs', 'soft_step'.*, got 'xpbd'"),
-        ({"solver": "soft_step", "substeps": 0}, "Options.substeps must be an integer of at least 1, got 0"),
-        ({"solver": "soft_step", "substeps": 2.5}, "Options.substeps must be an integer of at least 1, got 2.5"),
-        ({"substeps": 4}, "Options.substeps = 4 needs solver='soft_step', got solver='pgs'; .* divide dt"),
+        ({"solver": "newton"}, r"Options\.solver must be one of 'pgs', 'converged', 'soft_step', got 'newton'"),
+        ({"solver": "soft_step", "substeps": 0}, r"Options\.substeps must be an integer of at least 1, got 0"),
+        ({"solver": "soft_step", "substeps": 2.5}, r"Options\.substeps must be an integer of at least 1, got 2.5"),
+        ({"substeps": 4}, r"Options\.substeps = 4 needs solver='soft_step', got solver='pgs'; .* divide dt"),
+        ({"solver": "converged", "substeps": 2}, r"Options\.substeps = 2 needs solver='soft_step'"),
     ],
 )
 def test_bad_solver_settings_are_refused(arguments, message):

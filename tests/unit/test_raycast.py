@@ -1,7 +1,6 @@
 """Rays against an oracle that knows only which points are inside: dense samples along the ray and bisection, float64."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -25,8 +24,8 @@ from mathota_jax import (
 )
 from mathota_jax.collision.rays import RAYS
 from mathota_jax.geometry import SHAPES
+from tests.hulls import BOX_CORNERS
 
-CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 HOUSE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0.5, 1.6, 0], [0, 1, 0]])
 HOUSE = np.concatenate([HOUSE, HOUSE + np.array([0.2, 0.1, 0.7])])
 RANDOM = np.random.default_rng(7)
@@ -44,7 +43,7 @@ VARIANTS = {
     **SHAPE,
     "needle": Cone(0.01, 1.0),
     "coin": Cylinder(1.0, 0.01),
-    "plate": Polyhedron(CORNERS * [1.0, 0.01, 1.0]),
+    "plate": Polyhedron(BOX_CORNERS * [1.0, 0.01, 1.0]),
     "cloud": Polyhedron(RANDOM.normal(size=(40, 3))),
     "steps": Heightfield(np.round(RANDOM.uniform(size=(5, 5)) * 2), 0.4),
 }
@@ -225,7 +224,7 @@ def test_no_ray_slips_through_a_seam(precision):
     for slant in (np.array([0.0, 5.0, 0.0]), np.array([0.01, 5.0, 0.02])):
         down = np.broadcast_to(-slant, target.shape)
         assert np.all(cast(*scene(hills, np.zeros(3), Rotation.identity()), target + slant, down).hit)
-    box = cast(*scene(Box((0.5, 0.5, 0.5)), np.zeros(3), Rotation.identity()), CORNERS * 3, -CORNERS)
+    box = cast(*scene(Box((0.5, 0.5, 0.5)), np.zeros(3), Rotation.identity()), BOX_CORNERS * 3, -BOX_CORNERS)
     np.testing.assert_allclose(box.distance, 2.5 * np.sqrt(3), rtol=1e-6)
 
 

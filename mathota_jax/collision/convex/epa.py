@@ -9,6 +9,10 @@ touches one triangle, which is replaced by three (two if the sample lies on a si
 new entries of the table sit at the same place in every lane. The triangles cover all directions from the start, so no
 simplex that contains the origin is needed either.
 
+Every triangle proves something for itself, so a minimum in the middle of one, with the three points of its face in three
+different triangles, is approached from all sides for ever. A minimum at a *corner* of the partition is settled at once.
+Hence the frame of the first eight triangles is turned to the seed: a direction that is a local minimum already.
+
 Over a triangle the maximum of its three linear functions is least at a corner (sampled), at the crossing of two of them
 on a side, or where all three are equal: the normal of the face they span.
 """
@@ -23,7 +27,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import Difference, unit
 from mathota_jax.spatial.settle import settle_code
-from mathota_jax.spatial.vector import Vec3, cross, dot, where
+from mathota_jax.spatial.vector import Vec3, cross, dot, tangent_basis, where
 
 CORNERS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 OCTANTS = ((0, 2, 4), (2, 1, 4), (1, 3, 4), (3, 0, 4), (2, 0, 5), (1, 2, 5), (3, 1, 5), (0, 3, 5))
@@ -36,14 +40,25 @@ SLIVER_ROUNDING = 256.0
 """The common normal must be lower than a side by this many round-offs of the size to be sampled before it."""
 FLAT_ROUNDING = 64.0
 """Three points whose angle is below this many round-offs span no face: their normal is noise."""
+SAME_ROUNDING = 16.0
+"""Points closer than this many round-offs of the size are the same: where they cross is noise, and a direction that
+leaves its triangle would leave a hole in the partition. What is passed over so is lower by no more than that."""
 
 
 class Penetration(NamedTuple):
-    """Direction of least overlap: unit, from A to B; the depth [size] along it; whether it is proved to be the least."""
+    """What a search found.
+
+    Attributes:
+        direction: Unit direction of least overlap seen, from A to B.
+        depth: Depth [size] along it: an upper bound of the least depth.
+        lower: Proved lower bound [size] of the least depth.
+        seed_depth: Depth [size] along the seed.
+    """
 
     direction: Vec3
     depth: Array
-    converged: Array
+    lower: Array
+    seed_depth: Array
 
 
 class _State(NamedTuple):
@@ -57,21 +72,26 @@ class _State(NamedTuple):
     done: Array
 
 
-def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
+def epa(
+    shapes: Difference, seed: Vec3, wanted: Array, limit: Array | int, capacity: int, tolerance: float
+) -> Penetration:
     """Least overlap of two shapes that overlap.
 
     Args:
         shapes: The shapes, not differentiated.
+        seed: Unit direction from A to B, best a local minimum of the depth.
         wanted: bool ``(pair, world)``, False where the result is not needed. Those lanes stop at once.
-        iterations: Most iterations, at most ``BASE - 6``. All lanes stop as soon as they have converged.
+        limit: Most iterations, at most `capacity`. All lanes stop as soon as they have converged.
+        capacity: Static size of the tables in iterations, at most ``BASE - 6``.
+        tolerance: The depth is searched to this share of the size.
     """
     number = shapes.position.x.dtype
-    tolerance = 16.0 * float(jnp.finfo(number).eps)
     lanes = jnp.shape(wanted)
-    capacity = len(CORNERS) + iterations
+    frame = (seed, *tangent_basis(seed))
+    assert len(CORNERS) + capacity <= BASE
 
     def sample_corner(corner: Array) -> tuple[Vec3, Vec3, Array]:
-        direction = Vec3(*(jnp.broadcast_to(corner[k], lanes) for k in range(3)))
+        direction = frame[0] * corner[0] + frame[1] * corner[1] + frame[2] * corner[2]
         return direction, *_sample(shapes, direction)
 
     axes, points, heights = lax.map(sample_corner, jnp.asarray(CORNERS, number))
@@ -82,9 +102,9 @@ def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
         return tuple(vectors.map(lambda c, k=k: c[octants[:, k]]) for k in range(3))
 
     bounds, _ = _least(of_octants(axes), of_octants(points))
-    rest = jnp.zeros((iterations, *lanes), number)
-    infinite = jnp.full((3 * iterations, *lanes), jnp.inf, number)
-    numbers = np.concatenate([octants @ [1, BASE, BASE * BASE], np.zeros(3 * iterations)])
+    rest = jnp.zeros((capacity, *lanes), number)
+    infinite = jnp.full((3 * capacity, *lanes), jnp.inf, number)
+    numbers = np.concatenate([octants @ [1, BASE, BASE * BASE], np.zeros(3 * capacity)])
     state = _State(
         turn=jnp.zeros((), jnp.int32),
         corners=axes.map(lambda c: jnp.concatenate([c, rest])),
@@ -132,10 +152,9 @@ def epa(shapes: Difference, wanted: Array, iterations: int) -> Penetration:
             done=done,
         )
 
-    assert capacity <= BASE
-    state = lax.while_loop(lambda s: (s.turn < iterations) & ~jnp.all(s.done), advance, state)
-    converged = state.done | (jnp.min(state.bounds, axis=0) >= state.best - tolerance)
-    return Penetration(state.direction, state.best, converged)
+    state = lax.while_loop(lambda s: (s.turn < limit) & ~jnp.all(s.done), advance, state)
+    lower = jnp.minimum(state.best, jnp.min(state.bounds, axis=0))  # the bounds leave out the sampled corners
+    return Penetration(state.direction, state.best, lower, heights[0])
 
 
 def _row(table: Array, index: Array) -> Array:
@@ -161,11 +180,12 @@ def _sample(shapes: Difference, direction: Vec3) -> tuple[Vec3, Array]:
 def _crossing(corners: tuple, points: tuple, i: int, j: int) -> tuple[Vec3, Array, Array]:
     """Where the functions of corners i and j are equal on the side between them: direction, bound, is it proper."""
     gap = points[j] - points[i]
-    # Both are non-negative, for each point is extreme at its own corner.
+    # Both are non-negative, for each point is extreme at its own corner; 0 where the points tie there.
     weight_i, weight_j = dot(gap, corners[j]), -dot(gap, corners[i])
     direction = corners[i] * weight_i + corners[j] * weight_j
     squared = dot(direction, direction)
-    proper = (weight_i > 0) & (weight_j > 0) & (squared > 0)
+    noise = SAME_ROUNDING * float(jnp.finfo(squared.dtype).eps)
+    proper = (weight_i > noise) & (weight_j > noise)
     bound = dot(points[i], direction) * lax.rsqrt(jnp.where(proper, squared, 1.0))
     return direction, jnp.where(proper, bound, jnp.inf), proper
 
@@ -186,7 +206,9 @@ def _least(corners: tuple, points: tuple) -> tuple[Array, Array]:
     edge, other = points[1] - points[0], points[2] - points[0]
     normal = cross(edge, other)
     squared = dot(normal, normal)
+    shortest = jnp.minimum(jnp.minimum(dot(edge, edge), dot(other, other)), dot(other - edge, other - edge))
     flat = squared <= (FLAT_ROUNDING * eps) ** 2 * dot(edge, edge) * dot(other, other)
+    flat |= shortest <= (SAME_ROUNDING * eps) ** 2
     weights = [dot(normal, cross(corners[i], corners[j])) for i, j in ((1, 2), (2, 0), (0, 1))]
     positive = (weights[0] > 0) & (weights[1] > 0) & (weights[2] > 0)
     negative = (weights[0] < 0) & (weights[1] < 0) & (weights[2] < 0)

@@ -36,7 +36,6 @@ class Simplex(NamedTuple):
         point_a: The closest point of A, in the frame of A.
         point_b: The closest point of B (before the shift), in the frame of A.
         overlap: bool, the shapes touch or overlap.
-        converged: bool.
     """
 
     direction: Vec3
@@ -44,7 +43,6 @@ class Simplex(NamedTuple):
     point_a: Vec3
     point_b: Vec3
     overlap: Array
-    converged: Array
 
 
 class _State(NamedTuple):
@@ -120,7 +118,7 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
     weights = barycentric(state.points, two, three)
     point_a = combine(weights, state.points_a)
     point_b = point_a + combine(weights, state.points) - shift
-    return Simplex(unit(state.closest, first), pieces, point_a, point_b, state.overlap, state.done)
+    return Simplex(unit(state.closest, first), pieces, point_a, point_b, state.overlap)
 
 
 def _choose(state: _State, point: Vec3, stop: Array) -> Array:

@@ -45,13 +45,17 @@ class Ties(NamedTuple):
 
 
 class Closest(NamedTuple):
-    """Unit normal from A to B and the closest points of the cores, in the frame of A, in units of the scale."""
+    """Unit normal from A to B and the closest points of the cores, in the frame of A, in units of the scale.
+
+    `consistent`: no other piece undercuts the tied ones. `inside`: the points are known to belong to their cores.
+    """
 
     normal: Vec3
     point_a: Vec3
     point_b: Vec3
     ties: Ties
-    converged: Array
+    consistent: Array
+    inside: Array
 
 
 class _Search(NamedTuple):
@@ -76,8 +80,14 @@ def polish(shapes: Difference, simplex: Simplex) -> Closest:
     normal = start + where(found.exact, stepped - lax.stop_gradient(stepped), start - start)
     points = [shapes.points(pieces, normal) for pieces in ties.pieces]
     weights = barycentric([b - a for a, b in points], ties.two, ties.three)
+    lowest = lax.stop_gradient(jnp.minimum(weights[0], jnp.minimum(weights[1], weights[2])))
     result = Closest(
-        normal, combine(weights, [a for a, _ in points]), combine(weights, [b for _, b in points]), ties, found.exact
+        normal,
+        combine(weights, [a for a, _ in points]),
+        combine(weights, [b for _, b in points]),
+        ties,
+        found.exact,
+        lowest >= -rounding,
     )
     best = found.best
     for of_b, kind in enumerate((shapes.kind_a, shapes.kind_b)):
@@ -265,7 +275,8 @@ def _flat_end(
             where(chosen, point_a, result.point_a),
             where(chosen, point_b, result.point_b),
             jax.tree.map(lambda new, old: jnp.where(chosen, new, old), _single(pieces), result.ties),
-            chosen | result.converged,
+            chosen | result.consistent,
+            ~chosen & result.inside,
         ),
         jnp.where(chosen, along, best),
     )

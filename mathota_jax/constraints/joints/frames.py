@@ -1,4 +1,4 @@
-"""Where the two frames of a joint are in the world, and the row parts that joints are composed of."""
+"""Where the two frames of a joint are in the world."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.bodies import Bodies, quaternion, vector
-from mathota_jax.constraints.assembly import Side
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot
+from mathota_jax.spatial.vector import Mat3, Vec3
 
 
 class JointFrames(NamedTuple):
@@ -33,23 +32,6 @@ class JointFrames(NamedTuple):
     parent: Mat3
     child: Mat3
     relative: Quaternion
-
-
-class JointRow(NamedTuple):
-    """One row of each joint of a kind.
-
-    Attributes:
-      parent, child: Jacobians.
-      error: position error, to become 0 (or not negative, if `one_sided`) [m] or [rad].
-      one_sided: whether the row only pushes.
-      damping: viscous coefficient of a damping row, None for a row with a position error.
-    """
-
-    parent: Side
-    child: Side
-    error: Array
-    one_sided: bool = False
-    damping: Array | None = None
 
 
 def joint_frames(model: Model, bodies: Bodies, joints: tuple[int, ...]) -> JointFrames:
@@ -78,47 +60,8 @@ def joint_frames(model: Model, bodies: Bodies, joints: tuple[int, ...]) -> Joint
     return compute_once(frames, offset.x)
 
 
-def translation_sides(frames: JointFrames, direction: Vec3) -> tuple[Side, Side]:
-    """Jacobian of the offset along a direction fixed in the parent."""
-    return Side(-direction, -cross(frames.arm_parent, direction)), Side(direction, cross(frames.arm_child, direction))
-
-
-def rotation_sides(direction: Vec3) -> tuple[Side, Side]:
-    """Jacobian of the relative rotation about a world direction."""
-    zero = direction * 0.0
-    return Side(zero, -direction), Side(zero, direction)
-
-
-def translation_row(frames: JointFrames, direction: Vec3) -> JointRow:
-    """Holds the anchors together along one direction (guide 9.4, position constraint)."""
-    return JointRow(*translation_sides(frames, direction), dot(frames.offset, direction))
-
-
-def axis_row(frames: JointFrames, normal: Vec3) -> JointRow:
-    """Keeps the child's axis perpendicular to one direction of the parent (guide 9.4, rotation constraint)."""
-    axis = frames.child.column_x
-    return JointRow(*rotation_sides(cross(axis, normal)), dot(axis, normal))
-
-
-def orientation_rows(frames: JointFrames) -> list[JointRow]:
-    """Holds the two joint frames parallel: three rows about the parent's axes."""
+def twist(frames: JointFrames) -> Array:
+    """Angle of the child about the axis [rad], in (-pi, pi], without the shortest turn between the two axes."""
     relative = frames.relative
-    # q and -q are the same rotation; the short way round has w > 0.
-    twice = jnp.where(relative.w < 0, -2.0, 2.0)
-    components = (relative.x * twice, relative.y * twice, relative.z * twice)
-    return [JointRow(*rotation_sides(column), error) for column, error in zip(frames.parent, components, strict=True)]
-
-
-def limit_rows(sides: tuple[Side, Side], coordinate: Array, limits: Array) -> list[JointRow]:
-    """Stops at a lower and an upper limit; `limits` is (joint, 2, world)."""
-    parent, child = sides
-    against = [Side(-side.linear, None if side.angular is None else -side.angular) for side in sides]
-    return [
-        JointRow(parent, child, coordinate - limits[:, 0], one_sided=True),
-        JointRow(against[0], against[1], limits[:, 1] - coordinate, one_sided=True),
-    ]
-
-
-def damping_row(sides: tuple[Side, Side], damping: Array) -> JointRow:
-    """Viscous resistance along the free coordinate."""
-    return JointRow(*sides, jnp.zeros_like(damping), damping=damping)
+    sign = jnp.where(relative.w < 0, -1.0, 1.0)
+    return 2.0 * jnp.arctan2(relative.x * sign, relative.w * sign)

@@ -1,0 +1,56 @@
+"""All contact slots of a scene: those of pairs that have their own, and behind them those of the close pairs."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.bodies import Bodies, vector
+from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
+from mathota_jax.constraints import compact, warm_start
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.spatial.vector import Vec3
+from mathota_jax.state import State
+
+
+def find_slots(
+    model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None
+) -> tuple[ContactSet, compact.ClosePairs | None]:
+    """Contacts in all slots, and the close pairs behind them; for scenes that have slots.
+
+    Args:
+      model: parameters and static scene.
+      bodies: all bodies.
+      free: as for `compact.close_pairs`.
+    """
+    scene, found, close = model.scene, [], None
+    if scene.pair_groups:
+        found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
+    if scene.broadphase is not None:
+        close = compact.close_pairs(model, bodies, free)
+        found += compact.contacts_of(model, bodies, close)
+    return join_contacts(found), close
+
+
+def bodies_of_slots(scene: Scene, close: compact.ClosePairs | None) -> tuple[Array, Array]:
+    """(slot, world or 1) bodies A and B of all slots."""
+    first, second = (jnp.asarray(side, jnp.int32).reshape(-1, 1) for side in scene.slot_bodies)
+    if close is None:
+        return first, second
+    found = compact.slot_bodies(scene, close)
+    first, second = (
+        jnp.concatenate([jnp.broadcast_to(own, (own.shape[0], more.shape[-1])), more])
+        for own, more in zip((first, second), found, strict=True)
+    )
+    return first, second
+
+
+def matched_force(scene: Scene, contacts: ContactSet, close: compact.ClosePairs | None, state: State) -> Vec3:
+    """Forces (slot, world) of the last step in the slots where their pairs and features are now; 0 for new ones."""
+    old, feature = vector(state.contact_force), state.contact_feature
+    parts = warm_start.matched_force(scene, contacts, old, feature)
+    if close is not None:
+        assert state.contact_pair is not None
+        parts += compact.matched_force(scene, close, contacts, old, feature, state.contact_pair)
+    return warm_start.join_forces(parts)

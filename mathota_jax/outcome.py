@@ -1,0 +1,108 @@
+"""The state at the end of a step, from moved bodies and solved impulses."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.bodies import Bodies
+from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.constraints import compact, contact, joint_layout
+from mathota_jax.constraints.assembly import collect
+from mathota_jax.constraints.problem import Problem
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.state import Flag, State
+
+
+def new_state(scene: Scene, state: State, moved: Bodies, kept: dict[str, Array], failed: Array | None = None) -> State:
+    """The new state with its flags.
+
+    Args:
+      scene: static structure.
+      state: before the step.
+      moved: the moving bodies after it.
+      kept: what `forces` gives.
+      failed: (world,) 1 where the constraints were not solved; None if that can not be.
+    """
+    moved = compute_once(moved, moved.position.x)
+    position, orientation, velocity, angular_velocity = (
+        _place(scene, getattr(state, name), getattr(moved, name))
+        for name in ("position", "orientation", "velocity", "angular_velocity")
+    )
+    finite = [jnp.isfinite(value).all((0, 1)) for value in (position, orientation, velocity, angular_velocity)]
+    broken = jnp.where(finite[0] & finite[1] & finite[2] & finite[3], 0, int(Flag.NON_FINITE))
+    if failed is not None:
+        broken = broken | jnp.where(failed > 0, int(Flag.SOLVER_NOT_CONVERGED), 0)
+    changes: dict[str, Any] = {
+        "position": position,
+        "orientation": orientation,
+        "velocity": velocity,
+        "angular_velocity": angular_velocity,
+        "applied_force": jnp.zeros_like(state.applied_force),
+        "applied_torque": jnp.zeros_like(state.applied_torque),
+        "flags": state.flags | broken.astype(state.flags.dtype),
+    }
+    if "flags" in kept:
+        kept = {**kept, "flags": changes["flags"] | kept["flags"].astype(state.flags.dtype)}
+    return dataclasses.replace(state, **{**changes, **kept})
+
+
+def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[str, Array]:
+    """Mean forces over the step and what they belong to, in the form in which the state keeps them; new flags."""
+    scene, count = model.scene, len(problem.joint_rows)
+    changes: dict[str, Array] = {}
+    if problem.joints is not None:
+        tables = [rows.table for rows in problem.joint_rows]
+        values = [impulse[:, 0] / model.dt for impulse in impulses[:count]]
+        changes["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
+    if problem.contacts is not None:
+        impulses = impulses[count:]
+        changes["contact_force"] = contact.slot_force(problem.contact_rows, list(impulses), scene.slot_count, model.dt)
+        changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
+        if problem.contacts.converged is not None or problem.close is not None:
+            changes["flags"] = _collision_flags(problem.contacts, problem.close)
+        if problem.close is not None:
+            changes["contact_pair"] = compact.pair_keys(scene, problem.close)
+    return changes
+
+
+def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> Array:
+    """Bits (world,) for what the collision phases could not do."""
+    flags = jnp.zeros(contacts.separation.shape[-1:], jnp.int32)
+    if contacts.converged is not None:
+        failed = (contacts.active & ~contacts.converged).any(0)
+        flags = flags | jnp.where(failed, int(Flag.NOT_CONVERGED), 0)
+    if close is not None:
+        flags = flags | jnp.where(close.overflow, int(Flag.CONTACT_OVERFLOW), 0)
+    return flags
+
+
+def merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:
+    """All bodies, the moving ones at their new place."""
+    return jax.tree.map(lambda old, new: _place(scene, old[:, None], [new])[:, 0], bodies, moved)
+
+
+def _place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:
+    """(body, component, world) array: static bodies from `old`, the others from components of shape (moving, world)."""
+    worlds = max(old.shape[-1], *(component.shape[-1] for component in components))
+    moving_count = len(scene.dynamic_bodies)
+    new = jnp.stack([jnp.broadcast_to(component, (moving_count, worlds)) for component in components], axis=1)
+    # Runs of bodies that are all moving or all static; a concatenation of slices is cheaper than a gather.
+    parts, start = [], 0
+    for is_static, run in itertools.groupby(range(scene.body_count), key=lambda body: scene.static[body]):
+        bodies = list(run)
+        if is_static:
+            parts.append(jnp.broadcast_to(take(old, bodies), (len(bodies), *new.shape[1:])))
+        else:
+            parts.append(new[start : start + len(bodies)])
+            start += len(bodies)
+    return jnp.concatenate(parts)

@@ -1,0 +1,285 @@
+"""The constraints of a step solved to round-off: proximal point method outside, semismooth Newton method inside.
+
+Outside, impulses are replaced by those of the stiffened laws (`proximal`), ``P <- law(P, J u + b)``, whose fixed points are
+the solutions of the nonlinear complementarity problem of contact with Coulomb friction: not of its convex relaxation.
+Inside, the velocity that agrees with such impulses, ``u = u_free + M^-1 J^T law(P, J u + b)``, is found by Newton's method
+in the velocities: a linear system of the size of the moving bodies, however many contacts there are, that is regular even
+where rows are redundant. A search along the step compares kinetic energies of the residual. The stiffness grows while
+all goes well and falls when Newton's method fails.
+
+Residuals are velocities times the root of each row's effective mass, so that units and sizes do not matter.
+
+Sources: R. T. Rockafellar, "Augmented Lagrangians and applications of the proximal point algorithm in convex
+programming", Math. Oper. Res. 1, 1976; P. Alart and A. Curnier, "A mixed formulation for frictional contact problems prone
+to Newton like solution methods", CMAME 92, 1991; J. Carpentier, Q. Le Lidec and L. Montaut, "From compliant to rigid
+contact simulation: a unified and efficient approach", RSS 2024 (proximal terms for over-determined contacts).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.solver import implicit, velocity_system
+from mathota_jax.solver.pgs import Rows, add_impulses, linearise, row_velocity
+from mathota_jax.solver.proximal import masses, slope, stiffen
+from mathota_jax.spatial.safe import safe_divide
+
+LIMIT = 150
+"""Largest number of linear systems in a solve. Measured: ten boxes at rest take 1 or 2, a falling pile 20."""
+
+NEWTON_LIMIT = 8
+"""Newton steps without success after which the problem is made softer."""
+
+TRIALS = 5
+"""Step lengths 1, 1/2, 1/4, ... of the search along a Newton step."""
+
+ENOUGH = 0.8
+"""Share of the energy of the residual at which a trial is taken at once."""
+
+INEXACT = 0.3
+"""Newton's method stops at this share of the residual before it."""
+
+SLOW = 0.5
+"""Share of the residual left by an outer step at which the stiffness grows."""
+
+PATIENCE = 4
+"""Slow outer steps in a row after which a residual that is acceptable is accepted: the stiffness grew at each."""
+
+FIRST_STIFFNESS, STIFFNESS_FACTOR = 10.0, 10.0
+LARGEST_STIFFNESS = {"float32": 1e5, "float64": 1e9}
+"""The linear system loses the mass of a body beside a stiffness near the inverse of round-off."""
+
+TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
+"""Residual at which a world is done, relative to the largest velocity or constraint error of the unconstrained motion."""
+
+ACCEPTABLE = {"float32": 1e-3, "float64": 1e-6}
+"""Residual at which a world that no longer improves is done too; above it the world is flagged."""
+
+Impulses = tuple[Array, ...]
+
+
+class _Search(NamedTuple):
+    """State of the iteration; arrays (world,) but for the first four.
+
+    Attributes:
+      velocity: current, equal to that of the impulses `trial`.
+      trial: impulses of the inner iteration.
+      centre: impulses that the proximal term pulls to.
+      best: impulses with the least residual so far, and the velocity that was found with them: by increments, since the
+        round-off of large impulses, ``u_free + M^-1 J^T impulses``, would shake a light body under a heavy one.
+      least: that residual.
+      residual: after the last outer step.
+      stiffness: of the laws.
+      newton: Newton steps since the last outer step.
+      slow: outer steps in a row that hardly reduced the residual.
+      done: whether the world is finished.
+      count: () iterations.
+    """
+
+    velocity: Array
+    trial: Impulses
+    centre: Impulses
+    best: tuple[Array, Impulses]
+    least: Array
+    residual: Array
+    stiffness: Array
+    newton: Array
+    slow: Array
+    done: Array
+    count: Array
+
+
+class _Trial(NamedTuple):
+    """A point on the line of a Newton step, and the energy of its residual."""
+
+    step: Array
+    velocity: Array
+    trial: Impulses
+    impulses: Impulses
+    error: Impulses
+    change: Array
+    energy: Array
+
+
+@jax.custom_jvp
+def solve(rows: tuple[Rows, ...], velocity: Array, impulses: Impulses) -> tuple[Array, Impulses, Array]:
+    """Solves all rows together.
+
+    Args:
+      rows: groups of rows.
+      velocity: (component, block, world) without any constraint impulse.
+      impulses: for each group (turn, row, column, world), the impulses to start from.
+
+    Returns:
+      The velocity with the impulses, the impulses, and (world,) 1 where they are not the solution, else 0. Derivatives
+      are those of the solution, by the implicit function theorem; redundant rows do not disturb those of the velocity.
+    """
+    worlds = velocity.shape[-1]
+    if not rows:
+        return velocity, impulses, jnp.zeros(worlds, velocity.dtype)
+    problem = _Problem(rows, velocity)
+    impulses = tuple(jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in impulses)
+    start = add_impulses(rows, velocity, impulses)
+    residual = jnp.broadcast_to(problem.residual(impulses, problem.errors(start)), (worlds,))
+    search = _Search(
+        start,
+        impulses,
+        impulses,
+        (start, impulses),
+        residual,
+        residual,
+        jnp.full(worlds, FIRST_STIFFNESS, velocity.dtype),
+        jnp.zeros(worlds, jnp.int32),
+        jnp.zeros(worlds, jnp.int32),
+        residual <= problem.tolerance,
+        jnp.zeros((), jnp.int32),
+    )
+    search = lax.while_loop(lambda s: (s.count < LIMIT) & ~s.done.all(), problem.iterate, search)
+    failed = jnp.where(search.least <= problem.acceptable, 0.0, 1.0).astype(velocity.dtype)
+    return *search.best, failed
+
+
+class _Problem:
+    """One solve: rows, unconstrained velocity, and the scale of residuals."""
+
+    def __init__(self, rows: tuple[Rows, ...], free: Array) -> None:
+        self.rows, self.free = rows, free
+        self.root = [jnp.sqrt(masses(group.law)) for group in rows]
+        size = [dataclasses.replace(group, jacobian=tuple(jnp.abs(j) for j in group.jacobian)) for group in rows]
+        speed = _largest(r * row_velocity(s, jnp.abs(free)) for r, s in zip(self.root, size, strict=True))
+        none = tuple(jnp.zeros_like(group.bias) for group in rows)
+        scale = speed + self.residual(none, self.errors(free))
+        self.tolerance = TOLERANCE[str(free.dtype)] * scale
+        self.acceptable = ACCEPTABLE[str(free.dtype)] * scale
+
+    def errors(self, velocity: Array) -> Impulses:
+        """Constraint errors of all rows."""
+        return tuple(group.bias + row_velocity(group, velocity) for group in self.rows)
+
+    def residual(self, impulses: Impulses, errors: Impulses) -> Array:
+        """Largest distance (world,) of impulses from those that the laws ask for."""
+        return _largest(
+            safe_divide(jnp.abs(old - group.law.update(old, error)), jnp.broadcast_to(root, old.shape))
+            for group, old, error, root in zip(self.rows, impulses, errors, self.root, strict=True)
+        )
+
+    def project(self, stiffness: Array, centre: Impulses, errors: Impulses) -> Impulses:
+        """Impulses of the stiffened laws."""
+        return tuple(
+            stiffen(group.law, stiffness).update(old, error)
+            for group, old, error in zip(self.rows, centre, errors, strict=True)
+        )
+
+    def iterate(self, search: _Search) -> _Search:
+        """One Newton step; where that has solved the inner problem, the outer step as well."""
+        errors = self.errors(search.velocity)
+        impulses = self.project(search.stiffness, search.centre, errors)
+        slopes = tuple(
+            slope(stiffen(group.law, search.stiffness), old, error)
+            for group, old, error in zip(self.rows, search.centre, errors, strict=True)
+        )
+        change, energy = self.mismatch(search.trial, impulses)
+        factor = velocity_system.factorize(self.rows, slopes, self.free.shape[0])
+        direction = -velocity_system.solve(factor, change)
+        found = self.line_search(search, errors, impulses, slopes, direction, energy)
+
+        inner = _largest(r * jnp.abs(row_velocity(g, found.change)) for r, g in zip(self.root, self.rows, strict=True))
+        residual = jnp.maximum(inner, self.residual(found.impulses, found.error))
+        gives_up = search.newton >= NEWTON_LIMIT
+        outer = gives_up | (inner <= INEXACT * search.residual) | (inner <= self.tolerance)
+        slow = outer & (residual > SLOW * search.residual)
+        harder = outer & ~gives_up & (slow | (search.newton == 0))
+        stiffness = jnp.where(harder, search.stiffness * STIFFNESS_FACTOR, search.stiffness)
+        stiffness = jnp.where(gives_up, search.stiffness / STIFFNESS_FACTOR, stiffness)
+        slow_steps = jnp.where(outer, jnp.where(slow, search.slow + 1, 0), search.slow)
+        better = residual < search.least
+        new = _Search(
+            velocity=found.velocity,
+            trial=found.trial,
+            centre=_where(outer, found.impulses, search.centre),
+            best=_where(better, (found.velocity, found.impulses), search.best),
+            least=jnp.where(better, residual, search.least),
+            residual=jnp.where(outer, residual, search.residual),
+            stiffness=jnp.clip(stiffness, 1.0, LARGEST_STIFFNESS[str(self.free.dtype)]),
+            newton=jnp.where(outer, 0, search.newton + 1),
+            slow=slow_steps,
+            done=(residual <= self.tolerance) | ((slow_steps >= PATIENCE) & (search.least <= self.acceptable)),
+            count=search.count + 1,
+        )
+        kept = jax.tree.map(
+            lambda a, b: jnp.where(search.done, a, b), search._replace(count=()), new._replace(count=())
+        )
+        return kept._replace(done=search.done | new.done, count=new.count)
+
+    def mismatch(self, trial: Impulses, impulses: Impulses) -> tuple[Array, Array]:
+        """Velocity change from the one impulses to the others, and its kinetic energy, times 2."""
+        difference = tuple(a - b for a, b in zip(trial, impulses, strict=True))
+        change = add_impulses(self.rows, jnp.zeros_like(self.free), difference)
+        energy = [
+            (part * row_velocity(group, change)).sum((0, 1, 2))
+            for part, group in zip(difference, self.rows, strict=True)
+        ]
+        return change, functools.reduce(jnp.add, energy)
+
+    def line_search(
+        self,
+        search: _Search,
+        errors: Impulses,
+        impulses: Impulses,
+        slopes: Impulses,
+        direction: Array,
+        energy: Array,
+    ) -> _Trial:
+        """Halves the Newton step until the residual falls; the best of all trials if it does not."""
+        rates = tuple(row_velocity(group, direction) for group in self.rows)
+        toward = tuple(
+            part - old + (matrix * rate[:, None]).sum(2)
+            for part, old, matrix, rate in zip(impulses, search.trial, slopes, rates, strict=True)
+        )
+
+        def at(step: Array) -> _Trial:
+            trial = tuple(old + step * change for old, change in zip(search.trial, toward, strict=True))
+            there = tuple(error + step * rate for error, rate in zip(errors, rates, strict=True))
+            projected = self.project(search.stiffness, search.centre, there)
+            change, left = self.mismatch(trial, projected)
+            return _Trial(step, search.velocity + step * direction, trial, projected, there, change, left)
+
+        def body(carry: tuple[Array, Array, _Trial]) -> tuple[Array, Array, _Trial]:
+            count, step, best = carry
+            new = at(0.5 * step)
+            wanted = (new.energy < best.energy) & (best.energy > ENOUGH * energy)
+            return count + 1, new.step, _where(wanted, new, best)
+
+        def unfinished(carry: tuple[Array, Array, _Trial]) -> Array:
+            count, _, best = carry
+            return (count < TRIALS) & (~search.done & (best.energy > ENOUGH * energy)).any()
+
+        first = at(jnp.ones_like(energy))
+        return lax.while_loop(unfinished, body, (jnp.ones((), jnp.int32), first.step, first))[2]
+
+
+def _where(condition: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _largest(values: object) -> Array:
+    """Maximum over rows, (world,)."""
+    return functools.reduce(jnp.maximum, [value.max((0, 1, 2)) for value in values])  # type: ignore[attr-defined]
+
+
+@solve.defjvp
+def _solve_jvp(primals: tuple, tangents: tuple) -> tuple:
+    rows, velocity, impulses = primals
+    d_rows, d_velocity, _ = tangents
+    velocity, impulses, failed = solve(rows, velocity, impulses)
+    if not rows:
+        return (velocity, impulses, failed), (d_velocity, impulses, jnp.zeros_like(failed))
+    d_velocity, jacobians, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
+    d_velocity, d_impulses = implicit.solve(rows, jacobians, right_sides, d_velocity)
+    return (velocity, impulses, failed), (d_velocity, d_impulses, jnp.zeros_like(failed))

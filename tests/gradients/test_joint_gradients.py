@@ -1,0 +1,130 @@
+"""Derivatives of jointed motion against closed forms, and never NaN."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import (
+    BallAndSocket,
+    Box,
+    Distance,
+    Fixed,
+    Hinge,
+    SceneBuilder,
+    Slider,
+    Sphere,
+    joint_forces,
+    joint_position,
+    step,
+)
+from tests.scenes import undamped
+
+DT, STEPS = 1 / 240, 120
+HALF, MASS = (0.05, 0.25, 0.04), 2.0
+CENTRAL = MASS * (HALF[0] ** 2 + HALF[1] ** 2) / 3
+ARM, STIFFNESS, DAMPING, REST = 0.1, 3.0, 0.2, 0.4
+SERVO_STIFFNESS, SERVO_DAMPING, GEAR, ACTION = 5.0, 0.3, 0.5, 0.7
+DURATION = DT * STEPS
+
+
+def angle(stiffness, damping, rest, arm):
+    """Of a sprung pendulum in space at the end, from rest at 0."""
+    inertia = CENTRAL + MASS * arm**2
+    half = damping / (2 * inertia)
+    omega = np.sqrt(stiffness / inertia - half**2)
+    phase = omega * DURATION
+    return rest * (1 - np.exp(-half * DURATION) * (np.cos(phase) + half / omega * np.sin(phase)))
+
+
+def derivatives(function, arguments):
+    """Central differences of a closed form."""
+    found = []
+    for index, value in enumerate(arguments):
+        shifted = [[*arguments[:index], value + sign * 1e-5, *arguments[index + 1 :]] for sign in (1, -1)]
+        found.append((function(*shifted[0]) - function(*shifted[1])) / 2e-5)
+    return found
+
+
+def test_pendulum_by_its_parameters(float64, gate):
+    """A pendulum on a spring and one on a servo: both angles at 0.5 s, in one reverse pass."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    post = builder.add_body(Sphere(0.02), static=True, collides=False)
+    for options in ({"stiffness": STIFFNESS, "damping": DAMPING, "rest": REST}, {}):
+        rod = builder.add_body(Box(HALF), mass=MASS, position=(0, -ARM, 0), collides=False)
+        joint = builder.add_joint(Hinge(post, rod, (0, 0, 0), (0, 0, 1), **options))
+    builder.add_motor(joint, kind="position", stiffness=SERVO_STIFFNESS, damping=SERVO_DAMPING, gear=GEAR)
+    model, state = builder.build(undamped(dt=DT, velocity_iterations=30))
+
+    def final(model, action):
+        # The bodies hang where their anchors are.
+        start = dataclasses.replace(state, position=state.position.at[1:].set(-model.joint_anchor_child))
+        last, _ = jax.lax.scan(lambda s, _: (step(model, s, action), None), start, None, length=STEPS)
+        return joint_position(model, last).sum(), joint_position(model, last)
+
+    (by_model, by_action), angles = jax.jit(jax.grad(final, argnums=(0, 1), has_aux=True))(model, jnp.full(1, ACTION))
+    sprung, servo = (STIFFNESS, DAMPING, REST, ARM), (SERVO_STIFFNESS, SERVO_DAMPING, GEAR * ACTION, ARM)
+    gate("angle on the spring / truth - 1", angles[0] / angle(*sprung) - 1, 1e-4)
+    gate("angle on the servo / truth - 1", angles[1] / angle(*servo) - 1, 1e-4)
+    on_spring = (
+        by_model.joint_stiffness[0],
+        by_model.joint_damping[0],
+        by_model.joint_rest[0],
+        by_model.joint_anchor_child[0, 1],
+    )
+    on_servo = (
+        by_model.motor_stiffness[0],
+        by_model.motor_damping[0],
+        by_model.motor_gear[0] / ACTION,
+        by_model.joint_anchor_child[1, 1],
+    )
+    for place, arguments, leaves in (("spring", sprung, on_spring), ("servo", servo, on_servo)):
+        truths = derivatives(angle, arguments)
+        for name, value, leaf, truth in zip(
+            ("stiffness", "damping", "rest", "anchor"), arguments, leaves, truths, strict=True
+        ):
+            # Relative to the angle for a relative change of the parameter: some derivatives are nearly zero.
+            gate(f"{place}: d angle / d {name}", (leaf - truth) * value / angle(*arguments), 5e-4)
+    gate("d angle / d action and gear agree", by_action[0] / GEAR - by_model.motor_gear[0] / ACTION, 1e-9)
+    assert not np.any(np.asarray(by_model.motor_cap)), "the cap is far"
+
+
+def every_joint():
+    """Each kind with all that it can have, at rest at its built pose: at stops, slack springs, coincident axes."""
+    builder = SceneBuilder()
+    post = builder.add_body(Sphere(0.02), static=True, collides=False)
+    options = {"friction": 0.1, "damping": 0.2, "armature": 0.5}
+
+    def body():
+        return builder.add_body(Box(HALF), mass=MASS, position=(0.3, 0, 0), collides=False)
+
+    hinge = builder.add_joint(Hinge(post, body(), (0, 0, 0), (0, 0, 1), limits=(0, 1), stiffness=1.0, **options))
+    slider = builder.add_joint(Slider(post, body(), (0, 0, 0), (1, 0, 0), limits=(0, 1), **options))
+    builder.add_joint(
+        BallAndSocket(post, body(), (0, 0, 0), (0, 1, 0), swing=0.0, twist=(0, 1), friction=0.1, damping=0.1)
+    )
+    builder.add_joint(Fixed(post, body()))
+    builder.add_joint(Distance(post, body(), (0, 0, 0)))
+    rope = builder.add_joint(Distance(post, body(), (0.3, 0, 0), lengths=(0, 1), stiffness=2.0, **options))
+    for joint in (hinge, slider, rope):
+        builder.add_motor(joint, kind="velocity", cap=1.0)
+        builder.add_motor(joint, kind="position", stiffness=4.0 * MASS * 60**2, damping=0.0)
+    return builder.build()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["float32"], indirect=True)
+def test_no_derivative_is_nan(precision):
+    model, state = every_joint()
+
+    def loss(model, state, action):
+        after = step(model, step(model, state, action), action)
+        force, torque = joint_forces(model, after)
+        return sum(jnp.sum(x) for x in (after.position, after.orientation, after.velocity, force, torque))
+
+    gradients = jax.jit(jax.grad(loss, argnums=(0, 1, 2), allow_int=True))(model, state, jnp.zeros(6))
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):
+        if jnp.issubdtype(leaf.dtype, jnp.floating):
+            assert np.all(np.isfinite(np.asarray(leaf))), jax.tree_util.keystr(path)

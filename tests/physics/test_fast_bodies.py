@@ -1,0 +1,225 @@
+"""Fast bodies pass through nothing (benchmark B12, guide 10.4)."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import (
+    Box,
+    Capsule,
+    Cone,
+    Cylinder,
+    Options,
+    Plane,
+    Polyhedron,
+    SceneBuilder,
+    Sphere,
+    step,
+)
+from tests.scenes import advance, body_on_plane, motion, record_worlds, repeat, rotation_matrix, slab_on_plane, undamped
+
+DT = 1 / 60
+RUNS = 1000
+SHAPES = {
+    "sphere": Sphere(0.1),
+    "capsule": Capsule(0.1, 0.2),
+    "box": Box((0.4, 0.1, 0.1)),
+    "cylinder": Cylinder(0.1, 0.2),
+    "cone": Cone(0.15, 0.2),
+    "polyhedron": Polyhedron([(0.3, 0, 0), (-0.3, 0, 0), (0, 0.1, 0), (0, -0.1, 0), (0, 0, 0.2), (0, 0, -0.2)]),
+}
+OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in ("capsule", "cylinder", "cone", "polyhedron")]
+
+
+def flying(shape, obstacle, continuous, surface=None, **body):
+    """Body 0: an obstacle about the origin; body 1: the shape, in free space."""
+    surface = surface or {"friction": 0.5}
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    builder.add_body(obstacle, static=True, **surface)
+    builder.add_body(shape, **{"density": 1000.0, "position": (-5, 0, 0), **surface, **body})
+    return builder.build(undamped(dt=DT, continuous=continuous))
+
+
+def shots(state, speed, spin, seed=0):
+    """A batch that flies at the wall x = 0 from the left, from all sides and in every orientation."""
+    rng = np.random.default_rng(seed)
+    speed, spin = np.broadcast_to(speed, RUNS), np.broadcast_to(spin, RUNS)
+    place = np.stack([-rng.uniform(0.6, 4, RUNS), *rng.uniform(-3, 3, (2, RUNS))], axis=-1)
+    heading = np.stack([np.ones(RUNS), *rng.uniform(-0.5, 0.5, (2, RUNS))], axis=-1)
+    turn, axis = rng.normal(size=(RUNS, 4)), rng.normal(size=(RUNS, 3))
+    turn /= np.linalg.norm(turn, axis=-1, keepdims=True)
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    states = repeat(state, RUNS)
+    return dataclasses.replace(
+        states,
+        position=states.position.at[:, 1].set(place),
+        orientation=states.orientation.at[:, 1].set(turn),
+        velocity=states.velocity.at[:, 1].set(heading * speed[:, None]),
+        angular_velocity=states.angular_velocity.at[:, 1].set(axis * spin[:, None]),
+    )
+
+
+def escapes(model, states, steps=20):
+    """Which runs ever have the centre of body 1 beyond the middle of the wall, or end up not finite."""
+    final, record = record_worlds(repeat(model, RUNS), states, steps, motion)
+    assert not np.any(np.asarray(final.flags)), "the worlds stay finite"
+    return (np.asarray(record["position"])[:, :, 1, 0] > 0).any(0)
+
+
+@pytest.mark.parametrize("half", [0.1, 0.05, 5e-4], ids=["0.2 m", "0.1 m", "1 mm"])
+@pytest.mark.parametrize("continuous", [False, True])
+def test_a_sphere_never_passes_a_wall(continuous, half):
+    """B12a and f: 1000 runs at 1 to 200 m/s."""
+    model, state = flying(SHAPES["sphere"], Box((half, 20, 20)), continuous)
+    states = shots(state, 10 ** np.random.default_rng(1).uniform(0, 2.3, RUNS), 20.0)
+    assert not escapes(model, states).any()
+
+
+@pytest.mark.parametrize("half", [0.1, pytest.param(5e-4, marks=pytest.mark.slow)], ids=["0.2 m", "1 mm"])
+@pytest.mark.parametrize("shape", ["box", *OTHERS])
+def test_a_turning_body_never_passes_a_wall(shape, half):
+    """B12a: 1000 runs of every shape at 1 to 200 m/s, turning at up to 40 rad/s."""
+    model, state = flying(SHAPES[shape], Box((half, 20, 20)), continuous=True)
+    rng = np.random.default_rng(2)
+    states = shots(state, 10 ** rng.uniform(0, 2.3, RUNS), rng.uniform(0, 40, RUNS))
+    assert not escapes(model, states).any()
+
+
+def test_a_sphere_comes_to_rest_at_the_surface(precision, gate):
+    """B12a: with e = 0 at 180 m/s, straight at the wall, the surfaces meet and stay."""
+    for continuous, limit in ((False, 1e-5), (True, 2e-4)):
+        model, state = flying(Sphere(0.1), Box((0.1, 20, 20)), continuous, velocity=(180.0, 0, 0))
+        final = advance(model, state, 20)
+        gate("centre [m]", float(final.position[1, 0]) + 0.2, limit)
+        gate("velocity [m/s]", final.velocity[1], 1e-3)
+
+
+def test_an_elastic_ball_stays_in_its_room(float64, gate):
+    """B12c: 60 s at 170 m/s in a room of 20 x 20 x 10 m."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    surface = {"friction": 0.0, "restitution": 1.0}
+    half = np.array([10.0, 5.0, 10.0])
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            normal = np.zeros(3)
+            normal[axis] = -sign
+            builder.add_body(Plane(normal=normal, offset=-half[axis]), static=True, **surface)
+    ball = builder.add_body(Sphere(0.5), mass=1.0, velocity=(120.0, 7.0, 120.0), **surface)
+    for continuous in (False, True):
+        model, state = builder.build(undamped(dt=DT, continuous=continuous))
+        _, record = record_worlds(repeat(model, 1), repeat(state, 1), 3600, motion)
+        place = np.abs(np.asarray(record["position"])[:, 0, ball])
+        gate("centre outside of the room [m]", np.maximum(0.0, (place - half).max()), 0.0)
+        gate("overlap with a wall / radius", np.maximum(0.0, (place - (half - 0.5)).max()) / 0.5, 0.05)
+        energy = np.sum(np.asarray(record["velocity"])[:, 0, ball] ** 2, axis=-1)
+        gate("energy / start - 1", energy / (120.0**2 * 2 + 49) - 1, 1e-9)
+
+
+def test_a_spinning_stick_does_not_fall_through_the_ground():
+    """B12d: half (2, 0.1, 0.1) m at 100 m/s, turning at up to 50 rad/s."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    builder.add_body(Plane(normal=(-1, 0, 0), offset=0.0), static=True)
+    builder.add_body(Box((2.0, 0.1, 0.1)), mass=1.0, position=(-5, 0, 0))
+    model, state = builder.build(undamped(dt=DT, continuous=True))
+    states = shots(state, 100.0, np.random.default_rng(3).uniform(-50, 50, RUNS))
+    states = dataclasses.replace(states, position=states.position.at[:, 1, 0].add(-2.0))
+    assert not escapes(model, states, steps=40).any()
+
+
+@pytest.mark.parametrize("shape", ["sphere", pytest.param("box", marks=pytest.mark.slow)])
+def test_two_fast_bodies_that_meet_head_on_do_not_pass_each_other(shape):
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    for x in (-1.0, 1.0):
+        builder.add_body(SHAPES[shape], mass=1.0, position=(x, 0, 0))
+    model, state = builder.build(undamped(dt=DT, continuous=True))
+    rng = np.random.default_rng(4)
+    states = repeat(state, RUNS)
+    speed = 10 ** rng.uniform(0.5, 2.3, (RUNS, 2))
+    velocity = np.zeros((RUNS, 2, 3))
+    velocity[:, 0, 0], velocity[:, 1, 0] = speed[:, 0], -speed[:, 1]
+    offset = rng.uniform(-0.02, 0.02, (RUNS, 2))
+    spin = 0.0 if shape == "sphere" else rng.normal(size=(RUNS, 2, 3)) * 10
+    states = dataclasses.replace(
+        states,
+        velocity=jnp.asarray(velocity, states.velocity.dtype),
+        angular_velocity=states.angular_velocity + spin,
+        position=states.position.at[:, 1, 1:].add(offset),
+    )
+    _, record = record_worlds(repeat(model, RUNS), states, 1, motion)
+    place = np.asarray(record["position"])[0]
+    assert (place[:, 0, 0] < place[:, 1, 0]).all()
+
+
+def test_a_sphere_that_passes_an_edge_is_not_stopped(precision, gate):
+    """It clears the top of the wall by 0.1 m at 180 m/s; the nearest point of the wall is ahead of it all the time."""
+    model, state = flying(
+        Sphere(0.1), Box((0.1, 1.0, 1.0)), True, position=(-3.0, 1.2, 0.0), velocity=(180.0, 0.0, 0.0)
+    )
+    final = advance(model, state, 3)
+    gate("velocity [m/s]", np.asarray(final.velocity[1]) - [180.0, 0.0, 0.0], 1e-4)
+    gate("place [m]", np.asarray(final.position[1]) - [-3.0 + 3 * 180 * DT, 1.2, 0.0], 1e-4)
+
+
+def test_the_stop_is_where_the_surfaces_meet(precision, gate):
+    """Obliquely at a plane, alone: x of the centre -0.1, the rest of the way the share of the step until then."""
+    model, state = flying(
+        Sphere(0.1), Plane(normal=(-1, 0, 0), offset=0.0), True, position=(-1.1, 0, 0), velocity=(120.0, 30.0, 0.0)
+    )
+    after = step(model, state)
+    gate("velocity untouched [m/s]", np.asarray(after.velocity[1]) - [120.0, 30.0, 0.0], 1e-5)
+    gate("place [m]", np.asarray(after.position[1]) - [-0.1, 0.25, 0.0], 2e-4)
+    assert float(after.position[1, 0]) < -0.1, "the surfaces do not overlap"
+
+
+def test_gradient_of_the_stop(float64, gate):
+    """With gap g and speeds u, v the stop is at x = -0.1 whatever they are, and at y = v g / u."""
+    model, state = flying(
+        Sphere(0.1), Plane(normal=(-1, 0, 0), offset=0.0), True, position=(-1.1, 0, 0), velocity=(120.0, 30.0, 0.0)
+    )
+
+    def place(velocity, x):
+        start = dataclasses.replace(
+            state, velocity=state.velocity.at[1].set(velocity), position=state.position.at[1, 0].set(x)
+        )
+        return step(model, start).position[1]
+
+    by_velocity, by_x = jax.jit(jax.jacrev(place, (0, 1)))(jnp.array([120.0, 30.0, 0.0]), -1.1)
+    gap = 1.0 - 1e-4  # to the distance at which it stops
+    truth = np.array([[0, 0, 0], [-30.0 * gap / 120**2, gap / 120.0, 0], [0, 0, gap / 120.0]])
+    gate("by the velocity", np.asarray(by_velocity) - truth, 1e-9)
+    gate("by the place", np.asarray(by_x) - [0.0, -30.0 / 120.0, 0.0], 1e-9)
+
+
+def test_slow_bodies_do_not_notice(precision):
+    """Neutral equals absent (benchmark M2): nothing moves by half its inner radius in a step."""
+    finals = []
+    for continuous in (False, True):
+        model, state = slab_on_plane(velocity=(1.0, 0.0, 0.3), options=undamped(dt=DT, continuous=continuous))
+        finals.append(advance(model, state, 40))
+    for name in ("position", "orientation", "velocity", "contact_force"):
+        np.testing.assert_array_equal(getattr(finals[0], name), getattr(finals[1], name), err_msg=name)
+
+
+def test_close_pairs_are_refused():
+    builder = SceneBuilder()
+    for x in range(3):
+        builder.add_body(Sphere(0.1), mass=1.0, position=(x, 0, 0))
+    with pytest.raises(ValueError, match="continuous"):
+        builder.build(Options(continuous=True, broadphase="all_pairs"))
+
+
+@pytest.mark.parametrize("dt", [1 / 60, 1 / 10])
+def test_a_fast_turn_keeps_its_energy(float64, dt, gate):
+    """A box in free flight at 60 rad/s: 1 and 6 rad a step. Energy and momentum follow from the equations of Euler."""
+    model, state = body_on_plane(Box((0.4, 0.1, 0.2)), gravity=(0, 0, 0), position=(0, 9, 0), options=undamped(dt=dt))
+    spin = 60.0 * np.array([0.3, 0.9, 0.33]) / np.linalg.norm([0.3, 0.9, 0.33])
+    state = dataclasses.replace(state, angular_velocity=state.angular_velocity.at[1].set(spin))
+    _, record = record_worlds(repeat(model, 1), repeat(state, 1), 60, motion)
+    inertia = np.asarray(model.inertia[1])
+    local = np.einsum("...ji,...j->...i", rotation_matrix(record["orientation"][:, 0, 1]),
+                      np.asarray(record["angular_velocity"])[:, 0, 1])  # fmt: skip
+    energy = np.sum(inertia * local**2, axis=-1)
+    gate("energy / start - 1", energy / np.sum(inertia * spin**2) - 1, 0.02 if dt < 0.05 else 0.3)

@@ -1,0 +1,73 @@
+"""`describe` says what a scene compiles to."""
+
+import jax
+import pytest
+
+from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, describe
+from tests.scenes import sphere_on_plane, undamped, with_dt
+
+
+def lines(model):
+    return dict(line.split(": ", 1) for line in describe(model).splitlines())
+
+
+def workshop(options=None, spheres=2):
+    """The plane, a crate with a limited, driven door, and loose balls."""
+    builder = SceneBuilder()
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True)
+    crate = builder.add_body(Box((0.5, 0.5, 0.5)), mass=5.0, position=(0, 0.5, 0))
+    door = builder.add_body(Box((0.4, 0.4, 0.02)), mass=1.0, position=(0, 0.5, 0.6))
+    hinge = builder.add_joint(
+        Hinge(parent=crate, child=door, anchor=(-0.4, 0.5, 0.6), axis=(0, 1, 0), limits=(0, 1), damping=0.1)
+    )
+    builder.add_motor(hinge)
+    for k in range(spheres):
+        builder.add_body(Sphere(0.1), mass=1.0, position=(3.0 + k, 0.1, 0.0), restitution=0.0)
+    return builder.build(options or Options())
+
+
+def test_what_a_scene_has():
+    found = lines(workshop()[0])
+    assert found["bodies"] == "5 (4 moving, 1 static)"
+    assert found["shapes"] == "1 plane, 2 box, 2 sphere"
+    # Two boxes and two spheres on the plane, two spheres with two boxes, two spheres; the joined boxes do not collide.
+    assert found["pairs with slots of their own, plane-box"].startswith("2 of up to 4 points")
+    assert found["pairs with slots of their own, sphere-box"].startswith("4 of up to 1 points, closed form")
+    assert "pairs with slots of their own, box-box" not in found
+    slots = 2 * 4 + 2 + 4 + 1
+    assert found["contact slots"] == str(slots)
+    assert found["rows"] == f"{3 * slots} of contacts, {5 + 2 + 1} of joints"
+    assert found["joints"] == "1 hinge (rows of their own: 1 lower, 1 upper, 1 damping)"
+    assert found["motors"] == "1 torque"
+    assert found["broadphase"] == "none"
+    present, absent = (set(found[key].split(", ")) for key in ("present", "absent"))
+    assert {"friction", "joints", "warm start", "linear damping", "gyroscopic torque"} <= present
+    assert absent == {"restitution", "sleep", "continuous collision"}
+    assert "dt=0.0166667" in found["settings"] and "velocity_iterations=10" in found["settings"]
+
+
+def test_what_a_scene_lacks():
+    builder = SceneBuilder()
+    builder.add_body(Sphere(0.1), mass=1.0)
+    model, _ = builder.build(undamped(warm_start=False, position_iterations=0))
+    found = lines(model)
+    assert found["present"] == "nothing"
+    assert found["contact slots"] == "0" and found["turns of a sweep"] == "0" and found["joints"] == "none"
+
+
+def test_the_broadphase_and_its_capacities():
+    model, _ = workshop(Options(broadphase="all_pairs", pair_capacity=7), spheres=4)
+    found = lines(model)
+    assert found["broadphase"] == "all_pairs of 6 shapes, up to 7 close pairs"
+    assert any(name.startswith("close pairs, sphere-sphere with a moving body") for name in found)
+
+
+@pytest.mark.parametrize("options", [None, Options(sleep=True), Options(broadphase="all_pairs", sleep=True)])
+def test_memory_is_that_of_the_state(precision, options):
+    model, state = workshop(options)
+    size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    assert lines(model)["memory of a state"] == f"{size} bytes a world"
+
+
+def test_the_present_time_step_is_shown():
+    assert "dt=0.25" in lines(with_dt(sphere_on_plane()[0], 0.25))["settings"]
