@@ -11,8 +11,6 @@ SWEEPS = "not converged with the default 10 sweeps; "
 SHORTFALLS: dict[str, str] = {
     "tests/physics/test_soft_step.py::test_chain_holds[10]": "the whip of the free end opens a joint by 1.41 % of a link "
     "for one step of 600, gate 1 %",
-    "tests/physics/test_soft_step.py::test_third_apex_of_a_dropped_sphere": "the impulse of an impact starts the next "
-    "substep too, and the ball sinks by up to 0.07 mm: at e = 0.25 the third apex, 0.24 mm high, is 1.5 % off, gate 1 %",
     "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
     "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
     "its centre ends up to 77 mm in the ground",

@@ -51,7 +51,7 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion) -> 
     return PositionError(
         start=packed(motion.start.error),
         limit=limit,
-        one_sided=jnp.asarray(laws == STOP).reshape(shape),
+        one_sided=jnp.asarray(laws == STOP).reshape(shape) if (laws == STOP).any() else None,
         curvature=curvature,
         force=_force_laws(scene, rows, model, motion, laws.reshape(shape)),
     )

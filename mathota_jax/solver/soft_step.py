@@ -32,6 +32,7 @@ from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import settle
 from mathota_jax.struct import pytree
 
 PHASE = 2.0 * math.pi / 4.0
@@ -47,7 +48,7 @@ HARDNESS = PHASE * (2.0 * DAMPING_RATIO + PHASE)
 """Response of a row to its own impulse, divided by its softness."""
 
 OVER_RELAXATION = 1.4
-"""Of joints, and of contacts that carried something before; an impact gets its exact step. Measured on a chain of 10 to 40
+"""Of joints, and of contacts and stops that carried something before; an impact gets its exact step. Measured on 10 to 40
 loads: at 1 it sloshes for seconds, from 1.3 to 1.5 it comes to rest within one, at 1.7 it diverges."""
 
 MANIFOLD_PASSES = 3
@@ -77,7 +78,7 @@ class PositionError:
     Attributes:
       start: at the start of the step; of a one-sided row it is a gap, negative where there is overlap.
       limit: largest velocity of a correction.
-      one_sided: whether the row only pushes, (turn, 1, column, 1), or of size 1.
+      one_sided: whether the row only pushes, (turn, 1, column, 1), or of size 1; None where all rows also pull.
       lever: time [s] that the impulse of a bounce has to act on the position; None for joints.
       curvature: what the turning of the Jacobian adds to ``J v`` in half a step; None where it does not turn.
       force: rows that obey a law of force instead; None without any.
@@ -85,7 +86,7 @@ class PositionError:
 
     start: Array
     limit: Array
-    one_sided: Array
+    one_sided: Array | None
     lever: Array | None = None
     curvature: Array | None = None
     force: ForceLaws | None = None
@@ -187,10 +188,12 @@ def solve(
         halves = tuple(0.5 * impulse for impulse in impulses)
         lasting = tuple(impulse[:, 0] > 0 for impulse in impulses)
         wanted = tuple(_law_bias(group, velocity, displacement, time, dt) for group in groups)
-        laws = tuple(_soft_law(group, before) for group, before in zip(groups, lasting, strict=True))
+        present = tuple(group.error.start + _moved(group, displacement, time, dt) for group in groups)
+        apart = tuple(_apart(group, error) for group, error in zip(groups, present, strict=True))
+        laws = tuple(_soft_law(*arguments) for arguments in zip(groups, lasting, apart, strict=True))
         biases = tuple(
-            _correction(group, law_bias, velocity, displacement, time, length, dt) + group.free_rate(middle)
-            for group, law_bias in zip(groups, wanted, strict=True)
+            _correction(group, law_bias, error, gap, velocity, time, length, dt) + group.free_rate(middle)
+            for group, law_bias, error, gap in zip(groups, wanted, present, apart, strict=True)
         )
         velocity, impulses = _sweep(1, rows, laws, biases, velocity + half, halves)
         displacement = displacement + length * velocity
@@ -322,17 +325,28 @@ def _coupling(group: Rows) -> Array:
     return functools.reduce(jnp.add, [block(jacobian[:, 0], response[:, 0]) for jacobian, response in sides])
 
 
-def _soft_law(group: _Group, lasting: Array) -> Any:
-    """Law of the first sweep, in which half of the impulse of a substep acts."""
+def _apart(group: _Group, present: Array) -> Array | None:
+    """Whether rows that only push are open now; None where all rows also pull."""
+    if group.error.one_sided is None:
+        return None
+    return settle(jnp.where(group.error.one_sided & (present > 0), 1.0, 0.0)) > 0.5
+
+
+def _soft_law(group: _Group, lasting: Array, apart: Array | None) -> Any:
+    """Law of the first sweep, in which half of the impulse of a substep acts; gaps close to the surface exactly."""
     coupling, law, force = group.coupling, group.rows.law, group.error.force
     if coupling is not None:
         points = group.rows.table.together
         own = coupling.reshape(*coupling.shape[:2], -1, points, coupling.shape[-1])
         own = jnp.stack([own[:, p, :, p] for p in range(points)], axis=2)
-        return Manifold(law, coupling, own.reshape(coupling.shape[0], *coupling.shape[2:]) / HARDNESS, lasting)
+        softness = own.reshape(coupling.shape[0], *coupling.shape[2:]) / HARDNESS
+        assert apart is not None
+        return Manifold(law, coupling, jnp.where(apart[:, 0], 0.0, softness), lasting)
     assert isinstance(law, Bounded)
     own = safe_divide(jnp.ones_like(law.effective_mass), law.effective_mass)
-    softness, mass = own / HARDNESS, law.effective_mass * (OVER_RELAXATION / (1.0 + 1.0 / HARDNESS))
+    softness = 1.0 / HARDNESS if apart is None else jnp.where(apart, 0.0, 1.0 / HARDNESS)
+    mass = law.effective_mass * (_lengthening(group, lasting) / (1.0 + softness))
+    softness = own * softness
     if force is None:
         return dataclasses.replace(law, softness=softness, effective_mass=mass)
     return Bounded(
@@ -341,6 +355,13 @@ def _soft_law(group: _Group, lasting: Array) -> Any:
         lower=0.5 * law.lower,
         upper=0.5 * law.upper,
     )
+
+
+def _lengthening(group: _Group, lasting: Array | None) -> Array | float:
+    """Factor on the step of the rows of a joint; a stop that is just met gets its exact step, or it would throw back."""
+    if group.error.one_sided is None or lasting is None:
+        return OVER_RELAXATION
+    return jnp.where(group.error.one_sided & ~lasting[:, None], 1.0, OVER_RELAXATION)
 
 
 def _rigid_law(group: _Group, carries: Array, lasting: Array | None) -> Any:
@@ -353,7 +374,7 @@ def _rigid_law(group: _Group, carries: Array, lasting: Array | None) -> Any:
     closed = jnp.where(carries | (law.lower < 0), law.effective_mass, 0.0)
     if coupling is not None:
         return Manifold(dataclasses.replace(law, effective_mass=closed), coupling, None, lasting)
-    longer = OVER_RELAXATION * closed
+    longer = _lengthening(group, lasting) * closed
     mass = longer if force is None else jnp.where(force.acts, closed, longer)
     return dataclasses.replace(law, effective_mass=mass)
 
@@ -384,13 +405,20 @@ def _law_bias(group: _Group, velocity: Array, displacement: Array, time: Array, 
 
 
 def _correction(
-    group: _Group, law_bias: Array | None, velocity: Array, displacement: Array, time: Array, length: Array, dt: Array
+    group: _Group,
+    law_bias: Array | None,
+    present: Array,
+    apart: Array | None,
+    velocity: Array,
+    time: Array,
+    length: Array,
+    dt: Array,
 ) -> Array:
-    """Bias of the first sweep: closes gaps at most, and takes out a share of an overlap."""
+    """Bias of the first sweep: closes gaps at most, and takes out a share of an overlap; `present` is the error now."""
     error = group.error
-    now = error.start + _moved(group, displacement, time, dt)
-    speed = jnp.clip(now * (SHARE / length), -error.limit, error.limit)
-    speed = jnp.where(error.one_sided & (now > 0), now / length, speed)
+    speed = jnp.clip(present * (SHARE / length), -error.limit, error.limit)
+    if apart is not None:
+        speed = jnp.where(apart, present / length, speed)
     if law_bias is not None:
         assert error.force is not None
         # A law holds at the end, for the rate u_1 = 2 u - u_0 that belongs to the rate u in the middle.

@@ -1,4 +1,4 @@
-"""The small-steps tier: stacks, friction, restitution, recovery from overlap, chains, momentum, derivatives."""
+"""The small-steps tier: stacks, friction, restitution, overlap, joints, other features, momentum, derivatives."""
 
 import dataclasses
 import functools
@@ -9,7 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Sphere, rollout
+from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
+from tests.benchmarks.hard_scenes import chain, joint_gaps, overlapping_pyramid
+from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, check
+from tests.gradients.test_bounce_gradient import run as bounce
+from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.physics.test_joint_drives import MASS, REST, STEPS, WEIGHT, of, oscillator
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -23,7 +28,6 @@ from tests.scenes import (
     per_body,
     record_worlds,
     repeat,
-    rotation_matrix,
     slab_on_plane,
     sphere_on_plane,
     tilted_gravity,
@@ -74,6 +78,7 @@ def test_stack_stands(count, gate):
     assert int(final.flags) == 0
 
 
+@pytest.mark.slow
 def test_ten_small_boxes_at_the_cost_target(precision, gate):
     """The setting for which the speed of the tier is quoted: 1/240 s in two substeps."""
     model, state = box_stack(10, options=soft(dt=1 / 240, substeps=2))
@@ -88,6 +93,7 @@ def test_ten_small_boxes_at_the_cost_target(precision, gate):
 FRICTIONS, HEADINGS = (0.2, 0.4, 0.7), (0.0, 11.25, 22.5, 33.75, 45.0)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_sliding_box_stops_where_coulomb_says(precision, gate):
     grid = list(itertools.product(FRICTIONS, (0.0, 45.0), HEADINGS))
     friction, yaw, heading = (np.array(column) for column in zip(*grid, strict=True))
@@ -128,6 +134,7 @@ SLOPES = [
 ]
 
 
+@pytest.mark.slow
 def test_slab_slides_down_as_coulomb_says(precision, gate):
     friction, angle = (np.array(column) for column in zip(*SLOPES, strict=True))
     path, slope = on_slopes(friction, angle), np.radians(angle)
@@ -138,6 +145,7 @@ def test_slab_slides_down_as_coulomb_says(precision, gate):
     gate("movement of those that stick in 3 s [m]", path[~slides], 1e-3)
 
 
+@pytest.mark.slow
 def test_slab_that_sticks_does_not_creep(precision, gate):
     friction, angle = (np.array(column) for column in zip(*SLOPES, strict=True))
     path = on_slopes(friction, angle)
@@ -173,7 +181,7 @@ def check_apexes(gate, apex, bounces, dt=1 / 240):
 
 def test_dropped_sphere(precision, gate):
     height, speed, apex = drop()
-    check_apexes(gate, apex, (1, 2))
+    check_apexes(gate, apex, (1, 2, 3))
     for world, e in enumerate(RESTITUTIONS):
         gate(f"e={e}: energy gained / energy", max(0.0, apex[:, world].max() - 1), 5e-4)
         gate(f"e={e}: overlap with the plane [m]", min(0.0, height[:, world].min()), 1e-3)
@@ -182,24 +190,15 @@ def test_dropped_sphere(precision, gate):
     gate("e=1: energy lost in 5 s", max(0.0, 1 - apex[-1, -1]), 1e-3)
 
 
-def test_third_apex_of_a_dropped_sphere(precision, gate):
-    check_apexes(gate, drop()[2], (3,))
-
-
 # Overlap (benchmark B10) ---------------------------------------------------------------------------------------------
 
 PUSH_OUT = 3.0
 """Largest push-out velocity [m/s] for a cube of 1 m."""
 
 
+@pytest.mark.slow
 def test_overlapping_pyramid_comes_apart_gently(gate):
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.6)
-    for row in range(4):
-        for column in range(4 - row):
-            place = (0.75 * (column + 0.5 * row), 0.5 + 0.75 * row, 0.0)
-            builder.add_body(Box((0.5, 0.5, 0.5)), density=1.0, position=place, friction=0.6)
-    model, state = builder.build(soft())
+    model, state = overlapping_pyramid(soft())
     final, record = recorded(model, state, 300)
     speed = np.linalg.norm(record["velocity"][:, 1:], axis=-1)
     gate("largest speed [m/s]", speed, 1.5 * PUSH_OUT + np.sqrt(2 * GRAVITY * 3.25))
@@ -227,50 +226,91 @@ def test_boxes_on_one_point_separate(spread, gate):
 # Chains (benchmark B7) -----------------------------------------------------------------------------------------------
 
 
-def chain(links, end_mass=None, spacing=1.0, **options):
-    """Capsules of length 1 hung from a fixed point, lying along X; a heavier ball at the end if `end_mass` is given."""
-    builder = SceneBuilder(gravity=DOWN)
-    parent = builder.add_body(Sphere(0.1), static=True, collides=False)
-    for index in range(links):
-        child = builder.add_body(
-            Capsule(0.125, 0.375), mass=5.98, position=(spacing * (index + 0.5), 0, 0),
-            orientation=axis_angle((0, 0, 1), np.pi / 2), collides=False,
-        )  # fmt: skip
-        builder.add_joint(Hinge(parent=parent, child=child, anchor=(spacing * index, 0, 0), axis=(0, 0, 1)))
-        parent = child
-    if end_mass:
-        ball = builder.add_body(Sphere(8.0), mass=end_mass, position=(links + 8.0, 0, 0), collides=False)
-        builder.add_joint(Hinge(parent=parent, child=ball, anchor=(links, 0, 0), axis=(0, 0, 1)))
-    return builder.build(soft(linear_damping=0.1, angular_damping=0.1, **options))
+def damped():
+    return soft(linear_damping=0.1, angular_damping=0.1)
 
 
-def joint_gaps(record, links):
-    """Distances [m] between the ends of neighbouring links; the axis of a link is its local -Y before the turn."""
-    position = record["position"][:, : links + 1]
-    along = -rotation_matrix(record["orientation"][:, : links + 1])[..., :, 1]
-    ends, starts = position + 0.5 * along, position - 0.5 * along
-    gaps = starts[:, 1:] - ends[:, :-1]
-    gaps[:, 0] = starts[:, 1]
-    return np.linalg.norm(gaps, axis=-1)
+def without_post(record):
+    return {name: values[:, 1:] for name, values in record.items()}
 
 
-@pytest.mark.parametrize("links", [6, pytest.param(10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("links", [pytest.param(6, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)])
 def test_chain_holds(links, gate):
-    model, state = chain(links)
+    model, state = chain(links, damped())
     _, record = recorded(model, state, 300 if links == 6 else 600)
-    gate("joint gap / link", joint_gaps(record, links), 0.01)
+    gate("joint gap / link", joint_gaps(without_post(record), links), 0.01)
 
 
 @pytest.mark.slow
 def test_ball_and_chain_holds(gate):
-    model, state = chain(40, end_mass=4021.0)
+    model, state = chain(40, damped(), end_mass=4021.0)
     _, record = recorded(model, state, 600)
-    gate("joint gap / link", joint_gaps(record, 40), 0.01)
+    gate("joint gap / link", joint_gaps(without_post(record), 40), 0.01)
+
+
+# Laws of joints, against the closed forms of `test_joint_drives` -----------------------------------------------------
+
+
+def test_springs_follow_the_oscillator(float64, gate):
+    """Each substep is exact for a coordinate alone, whatever the step; with a rotor or a damper of second order."""
+    for name, stiffness, damping, inertia, limit in (
+        ("spring", 50.0, 0.0, MASS, 1e-9),
+        ("geared", 50.0, 0.0, MASS + 6.0, 1e-5),
+        ("damped", 50.0, 3.0, MASS, 2e-3),
+        ("critical", 200.0, 40.0, MASS, 2e-3),
+    ):
+        for world in (0, 1):
+            time, found = of(float64, name, world, "soft_step")
+            truth = oscillator(time, stiffness, damping, inertia)
+            gate(f"{name}: place - truth, relative to the amplitude", (found["place"] - truth) / REST, limit)
+
+
+def test_springs_and_servos_of_any_stiffness_come_to_rest(float64, gate):
+    for name, target in (("rigid", REST), ("rigid and damped", REST), ("rigid servo", 0.2)):
+        _, found = of(float64, name, solver="soft_step")
+        gate(f"{name}: after sixty steps / target - 1", found["place"][60:] / target - 1, 1e-4)
+    gate("load / stiffness - 1", of(float64, "loaded", 0, "soft_step")[1]["place"][-1] * -400.0 / WEIGHT - 1, 1e-4)
+
+
+def test_friction_and_motors_give_no_more_than_their_caps(float64, gate):
+    time, brake = of(float64, "brake", solver="soft_step")
+    truth = np.maximum(1.5 - 4.0 / MASS * time, 0.0)
+    assert 10 < np.argmax(truth == 0) < STEPS
+    gate("brake: rate", brake["rate"] - truth, 1e-9)
+    gate("friction: creep while sticking [m]", of(float64, "sticks", 0, "soft_step")[1]["place"], 1e-6)
+    for name, cap in (("slips", 5.0), ("stalls", 10.0), ("weak servo", 10.0)):
+        _, found = of(float64, name, 0, "soft_step")
+        gate(f"{name}: rate / truth - 1", found["rate"] / (-(WEIGHT - cap) / MASS * time) - 1, 1e-4)
+    _, lifts = of(float64, "lifts", 0, "soft_step")
+    gate("velocity motor: rate - target", lifts["rate"][60:] - 0.5, 1e-5)
+    gate("velocity motor: force / weight - 1", lifts["force"][60:, 1] / WEIGHT - 1, 1e-3)
+
+
+# Other features ------------------------------------------------------------------------------------------------------
+
+
+def test_sleep_fast_bodies_and_a_step_of_no_time():
+    """A box that sleeps, a sphere at 180 m/s, 15 thicknesses a step, that must not pass a wall, and dt = 0."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True)
+    builder.add_body(Box((0.1, 5.0, 5.0)), static=True, position=(5.0, 5.0, 20.0))
+    box = builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(0, 0.1, 0))
+    ball = builder.add_body(Sphere(0.1), mass=1.0, position=(-7.0, 5.0, 20.0), velocity=(180.0, 0, 0))
+    model, state = builder.build(soft(sleep=True, continuous=True))
+    later = advance(model, state, 60)
+    np.testing.assert_allclose(later.position[ball, 0], 4.8, atol=1e-2)
+    assert np.asarray(is_asleep(model, later))[box]
+    last = advance(model, later, 60)
+    np.testing.assert_array_equal(last.position[box], later.position[box])
+    still = advance(dataclasses.replace(model, dt=jnp.zeros_like(model.dt)), state, 3)
+    for name in ("position", "velocity", "orientation"):
+        np.testing.assert_array_equal(getattr(still, name), getattr(state, name))
 
 
 # Momentum and free motion --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_free_collision_conserves_momentum(precision, gate):
     builder = SceneBuilder(gravity=(0, 0, 0))
     builder.add_body(Box((0.2, 0.1, 0.15)), mass=1.0, velocity=(1.0, 0.1, 0), angular_velocity=(1.0, 2.0, -1.0))
@@ -287,6 +327,7 @@ def test_free_collision_conserves_momentum(precision, gate):
     gate("angular momentum [kg m^2/s]", after[2] - before[2], 0.005)
 
 
+@pytest.mark.slow
 def test_flight_is_exact(precision, gate):
     """A box in flight above the plane: the parabola, and an angular momentum that stays."""
     model, state = body_on_plane(
@@ -318,6 +359,7 @@ def end_of_slide(parameters, model, state, count):
     return rollout(model, state, count)[0].position[1, 0]
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_derivatives_of_a_slide_to_rest(precision, gate):
     model, state = slab_on_plane(options=soft_undamped())
     values = {"speed": 2.0, "friction": 0.4, "gravity": GRAVITY}
@@ -331,6 +373,14 @@ def test_derivatives_of_a_slide_to_rest(precision, gate):
         forward = jax.jit(jax.jacfwd(end_of_slide), static_argnames="count")(values, model, state, count=45)
         for name in truth:
             gate(f"forward against reverse, {name}", float(forward[name] / reverse[name]) - 1, 1e-9)
+
+
+def test_derivatives_of_a_bounce(gate):
+    value, slopes = bounce(
+        height=1.0, velocity=0.0, restitution=0.8, gravity=GRAVITY, time=0.8, dt=1 / 240, solver="soft_step"
+    )
+    gate("height / truth - 1", value / 0.671884928 - 1, 1e-3)
+    check(gate, slopes, UNDER_GRAVITY, 0.01)
 
 
 @pytest.mark.slow
