@@ -171,12 +171,12 @@ def drop(dt=1 / 240):
 
 def check_apexes(gate, apex, bounces, dt=1 / 240):
     for world, e in enumerate(RESTITUTIONS):
-        for bounce in bounces:
-            rise = FALL_TIME * e**bounce
+        for nth in bounces:
+            rise = FALL_TIME * e**nth
             if 2 * rise < 3 * dt:
                 break  # too short a flight to contain a sample for certain
-            middle = FALL_TIME * (1 + 2 * sum(e**earlier for earlier in range(1, bounce))) + rise
-            gate(f"e={e}: apex {bounce} / truth - 1", apex[round(middle / dt) - 1, world] / e ** (2 * bounce) - 1, 0.01)
+            middle = FALL_TIME * (1 + 2 * sum(e**earlier for earlier in range(1, nth))) + rise
+            gate(f"e={e}: apex {nth} / truth - 1", apex[round(middle / dt) - 1, world] / e ** (2 * nth) - 1, 0.01)
 
 
 def test_dropped_sphere(precision, gate):
