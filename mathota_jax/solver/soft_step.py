@@ -123,11 +123,7 @@ class Manifold:
         if self.lasting is not None:
             new = jnp.maximum(old + jnp.where(self.lasting, OVER_RELAXATION, 1.0) * (new - old), 0.0)
         if isinstance(self.base, Cone):
-            base = self.base
-            if self.coupling.shape[0] > 1:
-                # The bounded step of several points, lengthened to just below the limit of stability.
-                base = dataclasses.replace(base, tangent_mass=base.tangent_mass * OVER_RELAXATION)
-            return base.with_friction(new, (impulse[1], impulse[2]), (error[1], error[2]))
+            return self.base.with_friction(new, (impulse[1], impulse[2]), (error[1], error[2]))
         return new[None]
 
     def _respond(self, change: Array) -> Array:
