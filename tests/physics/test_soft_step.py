@@ -290,11 +290,12 @@ def test_friction_and_motors_give_no_more_than_their_caps(float64, gate):
 
 
 def test_sleep_fast_bodies_and_a_step_of_no_time():
-    """A box that sleeps, a sphere at 180 m/s, 15 thicknesses a step, that must not pass a wall, and dt = 0."""
+    """A box on a shelf that sleeps, a sphere at 180 m/s, 15 thicknesses a step, that must not pass a wall, and dt = 0."""
     builder = SceneBuilder(gravity=DOWN)
     builder.add_body(Plane((0, 1, 0)), static=True)
     builder.add_body(Box((0.1, 5.0, 5.0)), static=True, position=(5.0, 5.0, 20.0))
-    box = builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(0, 0.1, 0))
+    builder.add_body(Box((0.5, 0.1, 0.5)), static=True, position=(0, 0.1, 0))
+    box = builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(0, 0.3, 0))
     ball = builder.add_body(Sphere(0.1), mass=1.0, position=(-7.0, 5.0, 20.0), velocity=(180.0, 0, 0))
     model, state = builder.build(soft(sleep=True, continuous=True))
     later = advance(model, state, 60)
