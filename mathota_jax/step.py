@@ -28,7 +28,7 @@ from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
 from mathota_jax.outcome import forces, merge, new_state
 from mathota_jax.scene import Scene
-from mathota_jax.solver import converged, pgs
+from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once, materialize
@@ -151,11 +151,16 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     problem = constrain(model, state, bodies, blocks, inertia, free, _gravity(model), action)
     packed = _pack(scene, *free)
     start = starting_impulses(model, state, problem, inertia, packed)
-    solved, impulses, failed = _solve(scene, problem, packed, start)
-    lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
-    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt)
+    lever, gained, failed = None, None, None
+    if scene.options.solver == "soft_step":
+        solved, gained, impulses = _small_steps(model, problem, blocks, packed, start)
+    else:
+        solved, impulses, failed = _solve(scene, problem, packed, start)
+        lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
+    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt, gained)
     moved, displacement = compute_once((moved, displacement), state.position)
-    moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
+    if scene.options.solver != "soft_step":
+        moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
         moved = _stop_at_impacts(model, bodies, moved, displacement)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
@@ -207,6 +212,21 @@ def _solve(
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
     return *pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start), None
+
+
+def _small_steps(
+    model: Model, problem: Problem, blocks: Bodies, free: Array, start: tuple[Array, ...]
+) -> tuple[Array, Array, tuple[Array, ...]]:
+    """Phases 5 to 7 in small steps: velocities, displacements by the impulses, and the impulses of the whole step."""
+    scene, options, rows = model.scene, model.scene.options, problem.rows
+    begin = _pack(scene, blocks.velocity, blocks.angular_velocity)
+    worlds = max([begin.shape[-1], free.shape[-1], *(group.bias.shape[-1] for group in rows)])
+    begin, free = (jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds)) for velocity in (begin, free))
+    count = options.substep_count
+    start = tuple(impulse / count for impulse in start)
+    rebound_sweeps = options.velocity_iterations if scene.restitution and problem.contact_rows else 0
+    added, gained, impulses = soft_step.solve(count, rebound_sweeps, rows, problem.errors, begin, free, start, model.dt)
+    return free + added, gained, impulses
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:

@@ -30,6 +30,7 @@ from mathota_jax.constraints.assembly import (
     select_blocks,
     unpack_sides,
 )
+from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
@@ -37,16 +38,12 @@ from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Places, Rows
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.indexing import take, unstack
-from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.safe import safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis
+from mathota_jax.spatial.vector import Vec3, cross, dot, tangent_basis
 
 RELAXATION = 4 / 3
 """Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
-
-
-ROUND_OFF = 64
-"""Multiples of the machine epsilon, of the velocities at play, within which a rebound is round-off."""
 
 
 class Motion(NamedTuple):
@@ -156,7 +153,12 @@ def contact_rows(
     start, free = (
         normal_velocity(table, jacobians, places, velocity) for velocity in (motion.velocity, motion.free_velocity)
     )
-    target, lever = _impact(scene, table, model, chosen, motion, start, free, pairs)
+    restitution = _pair_restitution(scene, table, model, pairs) if scene.restitution else None
+    approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
+    if scene.options.solver == "soft_step":
+        target, lever = rebound(approach, model.dt, model.dt * (1.0 + 1.0 / scene.options.substep_count))
+    else:
+        target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     normal_mass = active / _row_bound(table, jacobians, responses, active, (0,))
     bias = [-target]
@@ -261,70 +263,6 @@ def _push_only(effective_mass: Array) -> Bounded:
         jnp.broadcast_to(zero, shape),
         jnp.broadcast_to(zero + jnp.inf, shape),
     )
-
-
-def _impact(
-    scene: Scene,
-    table: Table | TracedTable,
-    model: Model,
-    contacts: ContactSet,
-    motion: Motion,
-    start: Array,
-    free: Array,
-    pairs: PlacedPairs | None,
-) -> tuple[Array, Array]:
-    """Normal velocity to reach at the end of the step, and the lever of the impulse.
-
-    `start` and `free` are the normal velocities at the start and, unconstrained, at the end of the step. A contact *hits*
-    if it overlaps or if its present velocity closes the gap within the step; other gaps may close no further than to 0.
-    """
-    dt = model.dt
-    gap = jnp.maximum(contacts.separation, 0.0)
-    hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(contacts.separation <= 0, 1.0, 0.0)) > 0
-    time = jnp.clip(jnp.where(hits & (start < 0), gap / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
-    # The gap changes by dt (start + end) / 2, so this end velocity closes it and no more.
-    target = jnp.where(hits, 0.0, -2.0 * gap / dt - start)
-    impact = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
-    # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
-    share = safe_divide(impact, impact + norm(motion.gravity) * dt)
-    lever = 0.5 * dt + share * (0.5 * dt - time)
-    if not scene.restitution:
-        return target, lever
-    acceleration = (free - start) / dt
-    bounce_velocity, bounce_time, bounces = _bounce(
-        scene, table, model, gap, start, acceleration, motion.gravity, pairs
-    )
-    return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
-
-
-def _bounce(
-    scene: Scene,
-    table: Table | TracedTable,
-    model: Model,
-    gap: Array,
-    start: Array,
-    acceleration: Array,
-    gravity: Vec3,
-    pairs: PlacedPairs | None,
-) -> tuple[Array, Array, Array]:
-    """End velocity, time of impact and whether the contact bounces, for constant acceleration within the step.
-
-    The impact is the first root tau of ``gap + start t + acceleration t^2 / 2``. Forces act before and after it: a
-    contact bounces if, after the impact, it still separates at the end of the step, beyond round-off. That is the only
-    threshold.
-    """
-    dt = model.dt
-    discriminant = start * start - 2.0 * acceleration * gap
-    approach = safe_sqrt(jnp.maximum(discriminant, 0.0))  # speed at the impact
-    divisor = approach - start
-    time = safe_divide(2.0 * gap, divisor)
-    restitution = _pair_restitution(scene, table, model, pairs)
-    velocity = restitution * approach + acceleration * (dt - time)
-    reaches = (discriminant >= 0) & (divisor > 0) & (time <= dt) & ((start < 0) | (gap > 0))
-    # Bodies at rest on one another move relative to each other by round-off, which is no impact.
-    noise = ROUND_OFF * jnp.finfo(dt.dtype).eps * (norm(gravity) * dt + jnp.abs(start) + jnp.abs(acceleration) * dt)
-    bounces = settle(jnp.where(reaches & (restitution > 0) & (velocity > noise), 1.0, 0.0)) > 0
-    return velocity, jnp.where(bounces, time, 0.0), bounces
 
 
 def _slot_bodies(scene: Scene, table: Table) -> tuple[np.ndarray, np.ndarray]:

@@ -9,23 +9,37 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia, pack_blocks
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints import compact, contact, joint, joint_layout, joint_rows, row_coefficients, warm_start
+from mathota_jax.constraints import (
+    compact,
+    contact,
+    joint,
+    joint_layout,
+    joint_rows,
+    row_coefficients,
+    substep_rows,
+    warm_start,
+)
 from mathota_jax.constraints.slots import find_slots, matched_force
 from mathota_jax.model import Model
 from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.soft_step import PositionError
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
 
 
 class Problem(NamedTuple):
-    """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word."""
+    """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
+
+    `errors` are those of all groups, for the small steps alone.
+    """
 
     joints: joint_rows.JointRows | None
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
     close: compact.ClosePairs | None
+    errors: tuple[PositionError, ...] = ()
 
     @property
     def rows(self) -> tuple[Rows, ...]:
@@ -44,15 +58,17 @@ def constrain(
 ) -> Problem:
     """Phases 2, 3 and 5: narrow phase and rows."""
     scene = model.scene
-    joints, tables = None, ()
+    small_steps = scene.options.solver == "soft_step"
+    joints, tables, errors = None, (), ()
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
         middle = joint_rows.joint_rows(model, joint_rows.moved_by(bodies, 0.5 * model.dt))
         coefficients = row_coefficients.row_coefficients(model, action)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
-        tables = tuple(
-            joint.velocity_rows(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene)
-        )
+        rows_of = substep_rows.joint_rows if small_steps else joint.velocity_rows
+        tables = tuple(rows_of(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene))
+        if small_steps:
+            errors = tuple(substep_rows.joint_error(scene, rows, model, joint_motion) for rows in tables)
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
         contacts, close = find_slots(model, bodies, free)
@@ -79,7 +95,9 @@ def constrain(
             for group in (close.groups if close else ())
             for table, pairs in group.tables
         ]
-    return Problem(joints, tables, contacts, contact_rows, close)
+    if small_steps:
+        errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
+    return Problem(joints, tables, contacts, contact_rows, close, errors)
 
 
 def starting_impulses(
@@ -95,6 +113,6 @@ def starting_impulses(
     if problem.contacts is not None:
         force = compute_once(matched_force(model.scene, problem.contacts, problem.close, state), state.position)
         start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
-        if len(model.scene.dynamic_bodies) > 1:
+        if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
             return warm_start.plausible(problem.rows, inertia, velocity, tuple(start))
     return tuple(start)

@@ -214,7 +214,7 @@ def _first_touch(model: Model, group: PairGroup, pairs: _Pairs, share: Array) ->
         return time, left, gap, normal, count + 1
 
     going = fast & (gap > target)
-    state = (zero, going, gap, normal, jnp.asarray(0))
+    state = (jnp.zeros_like(gap), going, gap, normal, jnp.asarray(0))
     time, going, gap, _, _ = lax.while_loop(lambda s: s[1].any() & (s[4] < ADVANCES), advance, state)
     touches = fast & (going | (gap - target <= 0.5 * touch))
     return jnp.where(touches, time, 1.0)

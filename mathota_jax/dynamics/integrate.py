@@ -21,8 +21,9 @@ def advance(
     torque: Vec3,
     decay: float | Array,
     solved: Array,
-    lever: Array,
+    lever: Array | None,
     dt: Array,
+    gained: Array | None = None,
 ) -> tuple[Bodies, tuple[Vec3, Vec3]]:
     """Moves the bodies through one step (guide 11.1, phase 6).
 
@@ -37,20 +38,29 @@ def advance(
       solved: (component, block, world) velocities with all constraint impulses.
       lever: (block, world) time [s] that the velocity change by the constraints had to act on the position.
       dt: time step.
+      gained: (component, block, world) displacement by the constraints where it is known itself, in place of the lever.
 
     Returns:
       Bodies at the end of the step; translation and rotation vector (world frame) of the step.
     """
     free_linear, free_angular = free
     solved_linear, solved_angular = unpack_blocks(solved)
-    shift = (bodies.velocity + free_linear) * (0.5 * dt) + (solved_linear - free_linear) * lever
+    gained_linear, gained_angular = (None, None) if gained is None else unpack_blocks(gained)
+    if gained_linear is None:
+        assert lever is not None
+        gained_linear = (solved_linear - free_linear) * lever
+    shift = (bodies.velocity + free_linear) * (0.5 * dt) + gained_linear
     start = inertia.apply(bodies.angular_velocity)
     end = (start + torque * dt) * decay
     mean = (start + end) * 0.5
     if solved_angular is not None:
         change = inertia.apply(solved_angular - free_angular)
         end = end + change
-        mean = mean + change * (lever / dt)
+        if gained_angular is not None:
+            mean = mean + inertia.apply(gained_angular) / dt
+        else:
+            assert lever is not None
+            mean = mean + change * (lever / dt)
     mean, end, shift = compute_once((mean, end, shift), bodies.position.x)
     orientation, turn = rotate_at_constant_momentum(bodies.orientation, inertia, mean, dt)
     orientation = compute_once(orientation, bodies.position.x)

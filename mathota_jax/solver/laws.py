@@ -7,6 +7,8 @@ are (row, column, world) or, for a whole table, (turn, row, ...).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -56,9 +58,13 @@ class Cone:
     def update(self, impulse: Array, error: Array) -> Array:
         """Normal row first, then the tangents with the normal's new impulse."""
         row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
-        old_n, old_1, old_2 = unstack(impulse, row)
-        error_n, error_1, error_2 = unstack(error, row)
-        normal = jnp.maximum(old_n - error_n * self.normal_mass, 0.0)
+        old_n, *old = unstack(impulse, row)
+        error_n, *errors = unstack(error, row)
+        return self.with_friction(jnp.maximum(old_n - error_n * self.normal_mass, 0.0), old, errors)
+
+    def with_friction(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> Array:
+        """All three rows for a new impulse of the normal row; `old` and `errors` are those of the tangents."""
+        (old_1, old_2), (error_1, error_2) = old, errors
         free_1 = old_1 - error_1 * self.tangent_mass
         free_2 = old_2 - error_2 * self.tangent_mass
         squared = free_1 * free_1 + free_2 * free_2
@@ -66,7 +72,7 @@ class Cone:
         # At the apex of the cone nothing sticks: a derivative must not see friction where nothing presses.
         sliding = squared >= limit * limit
         scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
-        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=row)
+        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
 
 
 Law = Bounded | Cone

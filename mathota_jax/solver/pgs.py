@@ -44,11 +44,12 @@ class Places:
     Attributes:
       blocks: for each side, (turn, constraint, world) velocity block; an empty place has block `block_count`, which does
         not exist. No block occurs twice in a turn.
-      turns: () number of turns that hold a constraint in some world; they are the first ones.
+      turns: () number of turns that hold a constraint in some world; they are the first ones. None for all turns: that
+        loop can be differentiated in reverse mode.
     """
 
     blocks: tuple[Array, ...]
-    turns: Array
+    turns: Array | None
 
 
 @pytree
@@ -96,12 +97,12 @@ def solve(
         return velocity, impulses
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law for group in rows)
-    return _iterate(
+    return sweeps(
         iterations, rows, lambda law, impulse, error: law.update(impulse, error), laws, biases, velocity, impulses
     )
 
 
-def _iterate(
+def sweeps(
     iterations: int,
     rows: tuple[Rows, ...],
     update: Update,
@@ -110,6 +111,8 @@ def _iterate(
     velocity: Array,
     impulses: tuple[Array, ...],
 ) -> tuple[Array, tuple[Array, ...]]:
+    """Plain sweeps, whose derivative is that of every update; `update` gets the coefficients of a group at each turn."""
+
     def sweep(_: int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         velocity, old = carry
         new = []
@@ -165,7 +168,8 @@ def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, 
         velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, (*values, old))
         return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
 
-    return lax.fori_loop(0, places.turns, body, (velocity, impulse))
+    turns = group.table.turn_count if places.turns is None else places.turns
+    return lax.fori_loop(0, turns, body, (velocity, impulse))
 
 
 def _turn(
@@ -364,7 +368,7 @@ def _solve_linear(
 
 def _linear_sweeps(iterations: int, rows: tuple[Rows, ...], coefficients: tuple[object, ...]) -> tuple[Array, ...]:
     zeros = tuple(jnp.zeros_like(group.bias) for group in rows)
-    return _iterate(iterations, rows, _linear_update, coefficients, zeros, _no_velocity(rows), zeros)[1]
+    return sweeps(iterations, rows, _linear_update, coefficients, zeros, _no_velocity(rows), zeros)[1]
 
 
 def _no_velocity(rows: tuple[Rows, ...]) -> Array:

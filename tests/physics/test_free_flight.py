@@ -80,3 +80,13 @@ def test_zero_gravity_is_allowed_and_keeps_the_velocity(precision):
     model, state = lone_sphere(undamped(), gravity=(0, 0, 0), velocity=(1.0, 2.0, 3.0))
     final = advance(model, state, 60)
     np.testing.assert_array_equal(np.asarray(final.velocity[0]), [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("rate", [1.0, 5.0])
+def test_thin_rod_turns_at_its_rate(precision, rate, gate):
+    """Moments 5000:1 across the rod: its momentum over the smallest moment is no bound of how fast it turns."""
+    builder = SceneBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_body(Box((0.5, 0.005, 0.005)), mass=1.0, angular_velocity=(0.0, 0.0, rate))
+    model, state = builder.build(undamped(dt=1 / 60))
+    end = advance(model, state, 60)
+    gate("angle after 1 s [rad]", angle_between(end.orientation[0], axis_angle((0, 0, 1), rate)), 2e-5)

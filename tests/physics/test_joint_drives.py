@@ -58,7 +58,7 @@ HINGES = {
 
 
 @functools.cache
-def recorded(precision):
+def recorded(precision, solver="pgs"):
     builder = SceneBuilder(gravity=DOWN)
     post = builder.add_body(Sphere(0.02), static=True, collides=False)
     actions = []
@@ -75,7 +75,7 @@ def recorded(precision):
     builder.add_joint(Distance(post, bob, (0, 0, 0)), name="tension")
     beam = builder.add_body(Box(HALF), mass=MASS, position=(LEVER, 0, 0), collides=False)
     builder.add_joint(Fixed(post, beam, (0, 0, 0)), name="cantilever")
-    model, state = builder.build(undamped(dt=STEP_SIZES[0], velocity_iterations=40))
+    model, state = builder.build(undamped(dt=STEP_SIZES[0], velocity_iterations=40, solver=solver))
 
     def observe(model, state):
         force, torque = joint_forces(model, state)
@@ -94,9 +94,9 @@ def recorded(precision):
     return names, {key: np.asarray(v, float) for key, v in record.items()}, {k: np.asarray(v) for k, v in start.items()}
 
 
-def of(precision, name, world=0):
+def of(precision, name, world=0, solver="pgs"):
     """Time, and everything of one joint: (step,) or (step, 3)."""
-    names, record, _ = recorded(str(precision))
+    names, record, _ = recorded(str(precision), solver)
     joint = names.index(name)
     time = STEP_SIZES[world] * (1 + np.arange(STEPS))
     return time, {key: record[key][:, world, joint] for key in ("place", "rate", "force", "torque")}

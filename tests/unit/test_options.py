@@ -19,6 +19,7 @@ DEFAULTS = {
     "broadphase": "auto",
     "pair_capacity": None,
     "solver": "pgs",
+    "substeps": None,
 }
 OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}
 
@@ -47,6 +48,21 @@ def test_bad_broadphase_is_refused(name, value):
         Options(**{name: value})
 
 
-def test_an_unknown_solver_is_refused():
-    with pytest.raises(ValueError, match=r"Options\.solver must be one of 'pgs', 'converged', got 'newton'"):
-        Options(solver="newton")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"solver": "newton"}, r"Options\.solver must be one of 'pgs', 'converged', 'soft_step', got 'newton'"),
+        ({"solver": "soft_step", "substeps": 0}, r"Options\.substeps must be an integer of at least 1, got 0"),
+        ({"solver": "soft_step", "substeps": 2.5}, r"Options\.substeps must be an integer of at least 1, got 2.5"),
+        ({"substeps": 4}, r"Options\.substeps = 4 needs solver='soft_step', got solver='pgs'; .* divide dt"),
+        ({"solver": "converged", "substeps": 2}, r"Options\.substeps = 2 needs solver='soft_step'"),
+    ],
+)
+def test_bad_solver_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Options(**arguments)
+
+
+def test_substeps_have_a_default_where_they_mean_something():
+    assert Options(solver="soft_step").substep_count == 4
+    assert Options(solver="soft_step", substeps=7).substep_count == 7

@@ -1,0 +1,97 @@
+"""When a contact meets within a step, what velocity it then asks for, and how long its impulse acts on the position."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.vector import Vec3, norm
+
+ROUND_OFF = 64
+"""Multiples of the machine epsilon, of the velocities at play, within which a rebound is round-off."""
+
+
+class Approach(NamedTuple):
+    """Normal motion of contacts (column, world) over a step.
+
+    Attributes:
+      separation: at the start.
+      start, free: normal velocities at the start and, unconstrained, at the end of the step.
+      restitution: coefficient of the pair; None where nothing bounces.
+      gravity: (1, world) components.
+    """
+
+    separation: Array
+    start: Array
+    free: Array
+    restitution: Array | None
+    gravity: Vec3
+
+
+def impact(approach: Approach, dt: Array) -> tuple[Array, Array]:
+    """Normal velocity to reach at the end of the step, and the lever of the impulse.
+
+    A contact *hits* if it overlaps or if its present velocity closes the gap within the step; other gaps may close no
+    further than to 0.
+    """
+    separation, start = approach.separation, approach.start
+    gap = jnp.maximum(separation, 0.0)
+    hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(separation <= 0, 1.0, 0.0)) > 0
+    time = jnp.clip(jnp.where(hits & (start < 0), gap / jnp.where(start < 0, -start, 1.0), 0.0), 0.0, dt)
+    # The gap changes by dt (start + end) / 2, so this end velocity closes it and no more.
+    target = jnp.where(hits, 0.0, -2.0 * gap / dt - start)
+    stopped = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
+    # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
+    share = safe_divide(stopped, stopped + norm(approach.gravity) * dt)
+    lever = 0.5 * dt + share * (0.5 * dt - time)
+    if approach.restitution is None:
+        return target, lever
+    acceleration = (approach.free - start) / dt
+    bounce_velocity, bounce_time, bounces = _bounce(approach, approach.restitution, gap, acceleration, dt, dt)
+    return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
+
+
+def rebound(approach: Approach, dt: Array, latest: Array) -> tuple[Array, Array]:
+    """The same for the small steps, which stop an approach at the surface before the restitution pass; 0 for no bounce.
+
+    An impact due just after the step may be met in it, by round-off or because of other contacts: those up to the time
+    `latest` count. The lever makes up for the flight after the impact: a body that left the surface with velocity u has
+    moved by ``u t + acceleration t^2 / 2`` and reached ``u + acceleration t``. It is bounded where that is nearly lost.
+    """
+    if approach.restitution is None:
+        return jnp.zeros(()), jnp.zeros(())
+    gap = jnp.maximum(approach.separation, 0.0)
+    acceleration = (approach.free - approach.start) / dt
+    velocity, time, bounces = _bounce(approach, approach.restitution, gap, acceleration, dt, latest)
+    flight = jnp.maximum(dt - time, 0.0)
+    leaving = velocity - acceleration * (dt - time)
+    velocity = jnp.maximum(leaving + acceleration * flight, 0.0)
+    mean = jnp.clip(safe_divide(leaving + 0.5 * acceleration * flight, velocity), 0.0, 2.0)
+    return jnp.where(bounces, velocity, 0.0), jnp.where(bounces, flight * mean, 0.0)
+
+
+def _bounce(
+    approach: Approach, restitution: Array, gap: Array, acceleration: Array, dt: Array, latest: Array
+) -> tuple[Array, Array, Array]:
+    """End velocity, time of impact and whether the contact bounces, for constant acceleration within the step.
+
+    The impact is the first root tau of ``gap + start t + acceleration t^2 / 2``. Forces act before and after it: a
+    contact bounces if it comes by the time `latest` and if, after it, the bodies still separate at the end of the step,
+    beyond round-off. That is the only threshold.
+    """
+    start = approach.start
+    discriminant = start * start - 2.0 * acceleration * gap
+    speed = safe_sqrt(jnp.maximum(discriminant, 0.0))  # at the impact
+    divisor = speed - start
+    time = safe_divide(2.0 * gap, divisor)
+    velocity = restitution * speed + acceleration * (dt - time)
+    reaches = (discriminant >= 0) & (divisor > 0) & (time <= latest) & ((start < 0) | (gap > 0))
+    # Bodies at rest on one another move relative to each other by round-off, which is no impact.
+    moved = norm(approach.gravity) * dt + jnp.abs(start) + jnp.abs(acceleration) * dt
+    noise = ROUND_OFF * jnp.finfo(dt.dtype).eps * moved
+    bounces = settle(jnp.where(reaches & (restitution > 0) & (velocity > noise), 1.0, 0.0)) > 0
+    return velocity, jnp.where(bounces, time, 0.0), bounces

@@ -1,0 +1,91 @@
+"""What the small steps (`solver.soft_step`) need to know of joints and contacts beyond their rows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.constraints import joint
+from mathota_jax.constraints.assembly import pack_scalars, select_blocks
+from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.constraints.joint import JointMotion
+from mathota_jax.constraints.joints.rows import HOLD, STOP
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.soft_step import ForceLaws, PositionError
+from mathota_jax.solver.table import Table
+from mathota_jax.spatial.indexing import take
+
+PUSH_OUT_RATE = 6.0
+"""Largest push-out velocity, in radii of the smaller body [1/s]: 3 m/s for a cube of 1 m, as in Box2D; of rows that only
+turn, in radians."""
+
+
+def joint_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
+    """Rows of one table whose laws are those of one substep; the turning of the Jacobian is left to `joint_error`."""
+    still = motion._replace(middle=motion.middle._replace(rate=motion.start.rate))
+    part = dataclasses.replace(model, dt=model.dt / scene.options.substep_count)
+    return joint.velocity_rows(scene, table, part, still)
+
+
+def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion) -> PositionError:
+    """Errors of the rows of `joint_rows`."""
+    table, worlds = rows.table, rows.bias.shape[-1]
+    slots = np.maximum(table.order, 0)
+    laws, curved = motion.start.laws[slots], motion.start.curved[slots]
+    shape = (table.turn_count, 1, table.column_count, 1)
+
+    def packed(values: Array) -> Array:
+        return pack_scalars(table, [take(values, slots)], worlds)
+
+    curvature = None
+    if curved.any():
+        curvature = jnp.where(curved.reshape(shape), packed(motion.middle.rate - motion.start.rate), 0.0)
+    moves = (rows.jacobian[0][:, :, :3] != 0).any(2)
+    limit = PUSH_OUT_RATE * jnp.where(moves, pack_scalars(table, [_smallest_radius(scene, rows, model)], worlds), 1.0)
+    return PositionError(
+        start=packed(motion.start.error),
+        limit=limit,
+        one_sided=jnp.asarray(laws == STOP).reshape(shape) if (laws == STOP).any() else None,
+        curvature=curvature,
+        force=_force_laws(scene, rows, model, motion, laws.reshape(shape)),
+    )
+
+
+def _force_laws(scene: Scene, rows: Rows, model: Model, motion: JointMotion, laws: np.ndarray) -> ForceLaws | None:
+    """How the biases of springs, dampers, friction and motors follow the coordinate; None where there are none."""
+    acts = ~np.isin(laws, (HOLD, STOP))
+    if not acts.any():
+        return None
+
+    def bias(error: Array, rate: Array) -> Array:
+        at = motion._replace(start=motion.start._replace(error=error, rate=rate))
+        return joint_rows(scene, rows.table, model, at).bias
+
+    error, rate = motion.start.error, motion.start.rate
+    by_error = jax.jvp(lambda error: bias(error, rate), (error,), (jnp.ones_like(error),))[1]
+    by_rate = jax.jvp(lambda rate: bias(error, rate), (rate,), (jnp.ones_like(rate),))[1]
+    return ForceLaws(jnp.asarray(acts), by_error, by_rate)
+
+
+def contact_error(scene: Scene, contact: ContactRows, model: Model) -> PositionError:
+    """Gaps and overlaps of one table."""
+    table, worlds = contact.rows.table, contact.rows.bias.shape[-1]
+    limit = PUSH_OUT_RATE * pack_scalars(table, [_smallest_radius(scene, contact.rows, model)], worlds)
+    return PositionError(contact.separation, limit, jnp.ones((1, 1, 1, 1), bool), contact.lever)
+
+
+def _smallest_radius(scene: Scene, rows: Rows, model: Model) -> Array:
+    """(turn * column, world) root mean square distance of the mass from the centre, of the smaller moving body.
+
+    Not the inner radius: a thin card must not be held to its thickness.
+    """
+    mass, inertia = take((model.mass, model.inertia), scene.dynamic_bodies)
+    radius = jnp.sqrt(inertia.sum(1) / (2.0 * mass))
+    sides = [select_blocks(rows.table, side, radius, rows.places) for side in range(len(rows.jacobian))]
+    return sides[0] if len(sides) == 1 else jnp.minimum(*sides)
