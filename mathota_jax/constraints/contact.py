@@ -160,12 +160,12 @@ def contact_rows(
     else:
         target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
-    normal_mass = active / _row_bound(table, jacobians, responses, active, (0,))
+    normal_mass = _inverse(_row_bound(table, jacobians, responses, active, (0,)), active)
     bias = [-target]
     if scene.friction:
         law = Cone(
             normal_mass=normal_mass,
-            tangent_mass=active / _row_bound(table, jacobians, responses, active, (1, 2)),
+            tangent_mass=_inverse(_row_bound(table, jacobians, responses, active, (1, 2)), active),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
@@ -238,6 +238,11 @@ def _row_bound(
     others = 1.0 - np.eye(count)[:, :, None]
     norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], *other, active.shape[-1]))
     return functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total) / RELAXATION
+
+
+def _inverse(bound: Array, active: Array) -> Array:
+    """Effective mass of the contacts that are there, 0 of the others (empty columns of a table have no response)."""
+    return jnp.where(active > 0, 1.0 / jnp.where(active > 0, bound, 1.0), 0.0)
 
 
 def _components(packed: Array) -> list[list[Array]]:
