@@ -34,10 +34,11 @@ class Options:
       position_percent: share of the position error corrected in a step. Guide 10.3.
       baumgarte: share of a joint's position error turned into velocity in a step. Guide 9.5.
       warm_start: start the solver from the impulses of the previous step. Guide 7.3 and 12.4.
-      broadphase: "auto": pairs that can never be many have their own contact slots, the others are found in every step by
-        the method that suits the size of the scene. "none": every pair has its own slots. Or the method: "all_pairs",
-        "sort_and_sweep", "grid", "bvh". Guide 5.4.
-      pair_capacity: pairs that the broadphase can find in one step; None for 8 times the number of moving shapes.
+      broadphase: "auto": in scenes of up to 20 possible pairs, and for planes, heightfields and polyhedra, each pair has its
+        own contact slots; the others are found in every step by the method that suits the size of the scene. "none": every
+        pair has its own slots. Or the method: "all_pairs", "sort_and_sweep", "grid", "bvh". Guide 5.4.
+      pair_capacity: pairs that the broadphase can find in one step; None for all of up to 300 possible ones, else 8 times
+        the number of moving shapes.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for twice as many as the solver's own.
       solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
         together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not

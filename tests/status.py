@@ -68,7 +68,12 @@ FEATURES = (
     Feature("fast bodies stopped at the time of impact", "mathota_jax.dynamics:events", "physics/test_fast_bodies.py"),
     Feature("fixed time step accumulator, interpolation", "mathota_jax:interpolate", "unit/test_time_stepping.py"),
     Feature("residuals, penetration, joint gaps, `describe`", "mathota_jax:residuals", "unit/test_residuals.py"),
-    Feature("GJK and EPA for general convex shapes", "mathota_jax.collision:convex", "unit/test_convex.py"),
+    Feature("GJK, with EPA for curved shapes", "mathota_jax.collision:convex", "unit/test_convex.py"),
+    Feature(
+        "separating axes for convex polytopes",
+        "mathota_jax.collision.convex:separating_axis",
+        "unit/test_separating_axis.py",
+    ),
     Feature("sleeping and islands", "mathota_jax.dynamics:sleep", "physics/test_sleep.py"),
     Feature("substepped soft contacts", "mathota_jax.solver:soft_step", "physics/test_soft_step.py"),
     Feature("articulated trees", "mathota_jax.dynamics:articulated", "physics/test_articulated.py"),
