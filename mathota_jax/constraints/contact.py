@@ -151,7 +151,7 @@ def contact_rows(
         jacobians.append(jacobian := compute_once(pack_sides(table, sides, worlds), chosen.separation))
         responses.append(pack_sides(table, [respond(row, inertia) for row in unpack_sides(jacobian)], worlds))
     start, free = (
-        normal_velocity(table, jacobians, places, velocity) for velocity in (motion.velocity, motion.free_velocity)
+        _normal_velocity(table, jacobians, places, velocity) for velocity in (motion.velocity, motion.free_velocity)
     )
     restitution = _pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
@@ -191,7 +191,7 @@ def contact_rows(
     )
 
 
-def normal_velocity(
+def _normal_velocity(
     table: Table | TracedTable, jacobians: Sequence[Array], places: Places | None, velocity: Array
 ) -> Array:
     """(turn * column, world) along the normals, of blocks (component, block, world)."""

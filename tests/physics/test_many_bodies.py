@@ -245,6 +245,7 @@ def test_small_scenes_have_no_broadphase():
         model, state = heap(count)
         assert (model.scene.broadphase is not None) == has_one, count
         assert (state.contact_pair is not None) == has_one
+    assert heap(24, continuous=True)[0].scene.broadphase is None  # fast bodies are followed from slot to slot
 
 
 def test_slots_do_not_grow_with_the_square_of_the_bodies():
