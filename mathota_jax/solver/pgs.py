@@ -164,7 +164,7 @@ def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, 
         )
         # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
         *values, old = values
-        old = store(old, old)
+        old = store(old, values[1][0][:, 0])
         velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, (*values, old))
         return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
 
@@ -208,8 +208,7 @@ def _gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
     if isinstance(blocks, jax.Array) and blocks.ndim == 2:
         if velocity.shape[1] <= MASKED_BLOCKS:
             parts = [jnp.where(blocks == k, part[:, None], 0.0) for k, part in enumerate(unstack(velocity, 1))]
-            chosen = functools.reduce(jnp.add, parts)
-            chosen = store(chosen, chosen)
+            chosen = _store_of_blocks(functools.reduce(jnp.add, parts), blocks)
         else:
             index = jnp.minimum(blocks, last)[None]
             chosen = jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds")
@@ -220,6 +219,11 @@ def _gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
     return chosen if chosen.shape[1] == 1 else jnp.repeat(chosen, together, axis=1)  # one block broadcasts
 
 
+def _store_of_blocks(values: Array, blocks: Array) -> Array:
+    """`store` for (component, constraint, world), linear in the values."""
+    return store(values, jnp.broadcast_to(blocks.astype(values.dtype), values.shape))
+
+
 def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
     """Adds to each block the change by the constraint that acts on it."""
     block_count = velocity.shape[1]
@@ -227,7 +231,7 @@ def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
         if velocity.shape[1] <= MASKED_BLOCKS:
             numbers = jnp.arange(block_count)[:, None]
             for blocks, change in zip(receivers, changes, strict=True):
-                for block, part in zip(unstack(blocks, 0), unstack(store(change, change), 1), strict=True):
+                for block, part in zip(unstack(blocks, 0), unstack(_store_of_blocks(change, blocks), 1), strict=True):
                     velocity = velocity + jnp.where(block == numbers, part[:, None], 0.0)
             return velocity
         # In a turn of places no block occurs twice, so the order in which a scatter adds does not matter.
