@@ -52,7 +52,7 @@ def placements():
 @pytest.mark.parametrize(
     ("restitution", "double"),
     [
-        (0.5, False),
+        pytest.param(0.5, False, marks=pytest.mark.slow),
         pytest.param(0.0, True, marks=pytest.mark.slow),
         pytest.param(0.0, False, marks=pytest.mark.slow),
         pytest.param(0.5, True, marks=pytest.mark.slow),
