@@ -15,7 +15,6 @@ from mathota_jax.bodies import (
     moving,
     moving_inertia,
     of_all_bodies,
-    pack_blocks,
     unpack,
     vector,
 )
@@ -149,7 +148,7 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     force, torque = _external(model, state, bodies, action)
     free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
     problem = constrain(model, state, bodies, blocks, inertia, free, _gravity(model), action)
-    packed = _pack(scene, *free)
+    packed = contact.pack_motion(scene, *free)
     start = starting_impulses(model, state, problem, inertia, packed)
     lever, gained, failed = None, None, None
     if scene.options.solver == "soft_step":
@@ -197,10 +196,6 @@ def _gravity(model: Model) -> Vec3:
     return Vec3(*(model.gravity[axis][None] for axis in range(3)))
 
 
-def _pack(scene: Scene, linear: Vec3, angular: Vec3) -> Array:
-    return pack_blocks(linear, angular if contact.couples_rotation(scene) else None)
-
-
 def _solve(
     scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
@@ -219,7 +214,7 @@ def _small_steps(
 ) -> tuple[Array, Array, tuple[Array, ...]]:
     """Phases 5 to 7 in small steps: velocities, displacements by the impulses, and the impulses of the whole step."""
     scene, options, rows = model.scene, model.scene.options, problem.rows
-    begin = _pack(scene, blocks.velocity, blocks.angular_velocity)
+    begin = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
     worlds = max([begin.shape[-1], free.shape[-1], *(group.bias.shape[-1] for group in rows)])
     begin, free = (jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds)) for velocity in (begin, free))
     count = options.substep_count
@@ -241,7 +236,7 @@ def _correct_positions(
     options = scene.options
     if not options.position_iterations or not problem.rows:
         return moved
-    packed = _pack(scene, *displacement)
+    packed = contact.pack_motion(scene, *displacement)
     rows: list[Rows] = []
     if problem.joints is not None:
         error = joint_rows.joint_rows(model, merge(scene, bodies, moved)).error
@@ -249,7 +244,8 @@ def _correct_positions(
             joint.position_rows(scene, group.table, problem.joints, error, inertia) for group in problem.joint_rows
         ]
     for group in problem.contact_rows:
-        change = pgs.row_velocity(group.rows, packed)[:, :1]
+        known = group.rows
+        change = pgs.first_row_velocity(known.table, known.jacobian, known.places, packed)
         rows.append(contact.position_rows(group, change, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)

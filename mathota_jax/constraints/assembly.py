@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -48,6 +49,12 @@ def select_blocks(table: Table | TracedTable, side: int, tree: Any, places: Plac
         return gather_columns(table, jnp.minimum(places.blocks[side], table.block_count - 1), tree)
     blocks = np.asarray(table.blocks[side], np.int32).reshape(-1)
     return take(tree, np.minimum(blocks, table.block_count - 1))
+
+
+def smaller_side(table: Table | TracedTable, values: Array, places: Places | None) -> Array:
+    """(turn * column, world) the smaller value (block, world) of the moving bodies of each column."""
+    sides = places.blocks if isinstance(table, TracedTable) and places else table.blocks  # type: ignore[union-attr]
+    return functools.reduce(jnp.minimum, [select_blocks(table, side, values, places) for side in range(len(sides))])
 
 
 def gather_columns(table: TracedTable, index: Array, tree: Any) -> Any:

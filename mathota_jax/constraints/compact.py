@@ -198,10 +198,7 @@ def _previous_places(scene: Scene, found: PairList, pair: Array) -> Array:
 
 def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     """Gives every listed pair a turn and a column."""
-    admissible = admissible_pairs(scene)
-    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
-    block_count, capacity = len(block_of), found.first.shape[0]
-    blocks = np.asarray([block_of.get(body, block_count) for body in admissible.bodies], np.int32)
+    block_count, capacity = len(scene.dynamic_bodies), found.first.shape[0]
     group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
     active = found.active
     turn_counts = [sum(tier.turn_count for tier in group.tiers) for group in scene.compact_groups]
@@ -210,7 +207,8 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     if scene.broadphase.one_by_one:
         colour = _ranks(group_of_pair, active, len(turn_counts))
     else:
-        ends = [jnp.asarray(blocks)[side] for side in (found.first, found.second)]
+        blocks = _blocks(scene)
+        ends = [blocks[side] for side in (found.first, found.second)]
         node_count = len(scene.compact_groups) * block_count
         nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
         priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
@@ -247,6 +245,12 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     return groups, lost
 
 
+def _blocks(scene: Scene) -> Array:
+    """(shape,) velocity block of the body of each shape that takes part; the number of blocks for static bodies."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    return jnp.asarray([block_of.get(body, len(block_of)) for body in admissible_pairs(scene).bodies], jnp.int32)
+
+
 def _ranks(group_of_pair: Array | int, active: Array, group_count: int) -> Array:
     """(listed pair, world) number of the pair among those of its group."""
     rank = jnp.zeros(active.shape, jnp.int32)
@@ -265,11 +269,9 @@ def _group_places(
     tables: list[TracedTable],
     used_turns: list[Array],
 ) -> GroupPlaces:
-    admissible = admissible_pairs(scene)
-    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
-    block_count = len(block_of)
-    blocks = jnp.asarray([block_of.get(body, block_count) for body in admissible.bodies], jnp.int32)
-    bodies = jnp.asarray(admissible.bodies, jnp.int32)
+    block_count = len(scene.dynamic_bodies)
+    blocks = _blocks(scene)
+    bodies = jnp.asarray(admissible_pairs(scene).bodies, jnp.int32)
     example = _example(scene, group)
     pair = tuple(
         jnp.where(active, gather(side, listed), spare)

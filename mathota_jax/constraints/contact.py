@@ -9,7 +9,7 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.bodies import InverseInertia
+from mathota_jax.bodies import InverseInertia, pack_blocks
 from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
     Side,
@@ -28,17 +28,19 @@ from mathota_jax.constraints.assembly import (
     respond,
     select,
     select_blocks,
+    smaller_side,
     unpack_sides,
 )
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
+from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Places, Rows
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.indexing import take, unstack
-from mathota_jax.spatial.safe import safe_sqrt
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, tangent_basis
 
@@ -116,6 +118,11 @@ def couples_rotation(scene: Scene) -> bool:
     return scene.friction or bool(scene.joints) or not kinds <= {"plane", "sphere"}
 
 
+def pack_motion(scene: Scene, linear: Vec3, angular: Vec3) -> Array:
+    """(component, block, world) motion of the moving bodies, without rotation where nothing couples to it."""
+    return pack_blocks(linear, angular if couples_rotation(scene) else None)
+
+
 def near_contacts(scene: Scene, model: Model, contacts: ContactSet) -> ContactSet:
     """The contacts without those so far ahead that they are left to the search along the motion (`SPECULATIVE`)."""
     sizes = [
@@ -151,7 +158,11 @@ def contact_rows(
         jacobians.append(jacobian := compute_once(pack_sides(table, sides, worlds), chosen.separation))
         responses.append(pack_sides(table, [respond(row, inertia) for row in unpack_sides(jacobian)], worlds))
     start, free = (
-        _normal_velocity(table, jacobians, places, velocity) for velocity in (motion.velocity, motion.free_velocity)
+        along.reshape(-1, along.shape[-1])
+        for along in (
+            pgs.first_row_velocity(table, jacobians, places, velocity)
+            for velocity in (motion.velocity, motion.free_velocity)
+        )
     )
     restitution = _pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
@@ -160,12 +171,13 @@ def contact_rows(
     else:
         target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
-    normal_mass = _inverse(_row_bound(table, jacobians, responses, active, (0,)), active)
+    # Empty columns of a table have no response.
+    normal_mass = safe_divide(active, _row_bound(table, jacobians, responses, active, (0,)))
     bias = [-target]
     if scene.friction:
         law = Cone(
             normal_mass=normal_mass,
-            tangent_mass=_inverse(_row_bound(table, jacobians, responses, active, (1, 2)), active),
+            tangent_mass=safe_divide(active, _row_bound(table, jacobians, responses, active, (1, 2))),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
@@ -179,7 +191,7 @@ def contact_rows(
         table=table,
         places=places,
     )
-    size = pack_scalars(table, [_smallest_size(scene, table, model, places)], worlds)
+    size = pack_scalars(table, [smaller_side(table, take(model.size, scene.dynamic_bodies), places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     return ContactRows(
         rows,
@@ -189,15 +201,6 @@ def contact_rows(
         scene.options.slop * size,
         size,
     )
-
-
-def _normal_velocity(
-    table: Table | TracedTable, jacobians: Sequence[Array], places: Places | None, velocity: Array
-) -> Array:
-    """(turn * column, world) along the normals, of blocks (component, block, world)."""
-    normals = [side[:, :1] for side in jacobians]
-    along = pgs.project_blocks(table, normals, places, velocity)
-    return along.reshape(-1, along.shape[-1])
 
 
 def _row_bound(
@@ -216,33 +219,20 @@ def _row_bound(
     """
     count = table.together
     # The length of a step does not move the fixed point: its derivative is not worth computing.
-    sides = [
-        (_components(jacobian), _components(response))
-        for jacobian, response in zip(*jax.lax.stop_gradient((jacobians, responses)), strict=True)
-    ]
-
-    def entry(row: int, column: int, first: tuple[int, ...] = (), second: tuple[int, ...] = ()) -> Array:
-        """Response of a row to a column: of each point, or, with points apart on two axes, to each point."""
-        terms = [
-            a.reshape(*a.shape[:1], *first, a.shape[-1]) * b.reshape(*b.shape[:1], *second, b.shape[-1])
-            for jacobian, response in sides
-            for a, b in zip(jacobian[row], response[column], strict=True)
-        ]
-        return functools.reduce(jnp.add, terms)
-
-    own, other = (-1, count, 1), (-1, 1, count)
-    total = _largest_eigenvalue(lambda row, column: entry(row, column, (-1,), (-1,)), rows)
+    jacobian, response = (
+        [_components(side) for side in sides] for sides in jax.lax.stop_gradient((jacobians, responses))
+    )
+    total = _largest_eigenvalue(jacobian, response, rows)
     if count == 1:
         return total
-    squared = sum((entry(row, column, own, other) ** 2 for row in rows for column in rows), jnp.zeros(()))
+
+    def block(row: int, column: int) -> Array:
+        return point_responses([side[row] for side in jacobian], [side[column] for side in response], count)
+
+    squared = sum((block(row, column) ** 2 for row in rows for column in rows), jnp.zeros(()))
     others = 1.0 - np.eye(count)[:, :, None]
-    norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], *other, active.shape[-1]))
+    norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], -1, 1, count, active.shape[-1]))
     return functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total) / RELAXATION
-
-
-def _inverse(bound: Array, active: Array) -> Array:
-    """Effective mass of the contacts that are there, 0 of the others (empty columns of a table have no response)."""
-    return jnp.where(active > 0, 1.0 / jnp.where(active > 0, bound, 1.0), 0.0)
 
 
 def _components(packed: Array) -> list[list[Array]]:
@@ -250,8 +240,15 @@ def _components(packed: Array) -> list[list[Array]]:
     return [unstack(row, 1) for row in unstack(packed, 1)]
 
 
-def _largest_eigenvalue(entry: Callable[[int, int], Array], rows: tuple[int, ...]) -> Array:
-    """Of the response of one point along one or two rows, given by its entries."""
+def _largest_eigenvalue(
+    jacobian: list[list[list[Array]]], response: list[list[list[Array]]], rows: tuple[int, ...]
+) -> Array:
+    """Of the response of one point along one or two rows; the arguments hold components by side and row."""
+
+    def entry(row: int, column: int) -> Array:
+        terms = [a * b for j, r in zip(jacobian, response, strict=True) for a, b in zip(j[row], r[column], strict=True)]
+        return functools.reduce(jnp.add, terms)
+
     if len(rows) == 1:
         return entry(rows[0], rows[0])
     first, second, coupling = entry(rows[0], rows[0]), entry(rows[1], rows[1]), entry(rows[0], rows[1])
@@ -307,13 +304,6 @@ def _pair_restitution(scene: Scene, table: Table | TracedTable, model: Model, pa
     """Smaller of the two coefficients (guide 8.2)."""
     a, b = _of_bodies(scene, table, pairs, model.restitution)
     return jnp.minimum(a, b)
-
-
-def _smallest_size(scene: Scene, table: Table | TracedTable, model: Model, places: Places | None) -> Array:
-    sizes = take(model.size, scene.dynamic_bodies)
-    sides = len(places.blocks if isinstance(table, TracedTable) and places else table.blocks)  # type: ignore[union-attr]
-    smallest = select_blocks(table, 0, sizes, places)
-    return smallest if sides == 1 else jnp.minimum(smallest, select_blocks(table, 1, sizes, places))
 
 
 def position_rows(contact: ContactRows, displacement: Array, percent: float) -> Rows:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia, pack_blocks
+from mathota_jax.bodies import Bodies, Inertia
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import (
     compact,
@@ -80,11 +80,8 @@ def constrain(
         )
         if scene.options.continuous:
             contacts = contact.near_contacts(scene, model, contacts)
-        rotating = contact.couples_rotation(scene)
-        now, then = (
-            pack_blocks(linear, angular if rotating else None)
-            for linear, angular in ((blocks.velocity, blocks.angular_velocity), free)
-        )
+        now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
+        then = contact.pack_motion(scene, *free)
         inverse = compute_once(inertia.inverse(), state.position)
         motion = contact.Motion(blocks.position, now, then, inverse, gravity)
         contact_rows = [

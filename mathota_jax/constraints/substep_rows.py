@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.constraints import joint
-from mathota_jax.constraints.assembly import pack_scalars, select_blocks
+from mathota_jax.constraints.assembly import pack_scalars, smaller_side
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.joint import JointMotion
 from mathota_jax.constraints.joints.rows import HOLD, STOP
@@ -86,6 +86,4 @@ def _smallest_radius(scene: Scene, rows: Rows, model: Model) -> Array:
     Not the inner radius: a thin card must not be held to its thickness.
     """
     mass, inertia = take((model.mass, model.inertia), scene.dynamic_bodies)
-    radius = jnp.sqrt(inertia.sum(1) / (2.0 * mass))
-    sides = [select_blocks(rows.table, side, radius, rows.places) for side in range(len(rows.jacobian))]
-    return sides[0] if len(sides) == 1 else jnp.minimum(*sides)
+    return smaller_side(rows.table, jnp.sqrt(inertia.sum(1) / (2.0 * mass)), rows.places)

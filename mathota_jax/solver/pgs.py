@@ -131,9 +131,10 @@ def _sweep(
 ) -> tuple[Array, Array]:
     """One pass over the turns of a group."""
     table: Table | TracedTable = group.table
-    scanned = (group.jacobian, group.response, bias, coefficients, impulse)
+    fixed = (group.jacobian, group.response, bias, coefficients)
     if isinstance(table, TracedTable):
-        return _sweep_places(group, update, (group.jacobian, group.response, bias, coefficients), velocity, impulse)
+        return _sweep_places(group, update, fixed, velocity, impulse)
+    scanned = (*fixed, impulse)
     if table.turn_count <= UNROLLED_TURNS:
         new = []
         for turn in range(table.turn_count):
@@ -152,7 +153,7 @@ def _sweep(
     return lax.scan(body, velocity, (indices, jnp.asarray(table.receivers), scanned))
 
 
-def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, impulse: Array) -> tuple[Array, Array]:
+def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, impulse: Array) -> tuple[Array, Array]:
     """One pass over those turns of a traced table that hold a constraint."""
     places = group.places
     assert places is not None
@@ -160,11 +161,12 @@ def _sweep_places(group: Rows, update: Update, scanned: tuple, velocity: Array, 
     def body(turn: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         velocity, impulse = carry
         blocks, values = jax.tree.map(
-            lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), (places.blocks, (*scanned, impulse))
+            lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), (places.blocks, (*fixed, impulse))
         )
-        # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
         *values, old = values
-        old = store(old, values[1][0][:, 0])
+        _, response, *_ = values
+        # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
+        old = store(old, response[0][:, 0])
         velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, (*values, old))
         return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
 
@@ -250,13 +252,19 @@ def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
 
 def row_velocity(group: Rows, velocity: Array) -> Array:
     """``J v`` of all rows of a group: (turn, row, column, world)."""
-    return project_blocks(group.table, group.jacobian, group.places, velocity)
+    return _project_blocks(group.table, group.jacobian, group.places, velocity)
 
 
-def project_blocks(
+def first_row_velocity(
     table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
 ) -> Array:
-    """``J v`` (turn, row, column, world) for rows that a table visits; arguments as in `Rows`."""
+    """``J v`` of the first row of each constraint, (turn, 1, column, world); arguments as in `Rows`."""
+    return _project_blocks(table, [side[:, :1] for side in jacobian], places, velocity)
+
+
+def _project_blocks(
+    table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
+) -> Array:
     if isinstance(table, TracedTable):
         assert places is not None
         gathered = [jax.vmap(lambda b: _gather(velocity, b, table.together))(blocks) for blocks in places.blocks]

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import pgs
+from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.spatial.indexing import unstack
@@ -303,22 +304,10 @@ def _sweep_jvp(count: int, primals: tuple, tangents: tuple) -> tuple:
 
 def _coupling(group: Rows) -> Array:
     """(turn, point, column, world) response of the normal of each column to the points of its own manifold."""
-    points = group.table.together
-
-    def block(jacobian: Array, response: Array) -> Array:
-        turns, components, columns, worlds = jacobian.shape
-        shape = (turns, components, columns // points, points, worlds)
-        left, right = jacobian.reshape(shape), response.reshape(shape)
-        terms = [
-            functools.reduce(
-                jnp.add, [unstack(left, 1)[c] * unstack(right, 1)[c][:, :, p : p + 1] for c in range(components)]
-            )
-            for p in range(points)
-        ]
-        return jnp.stack(terms, axis=1).reshape(turns, points, columns, worlds)
-
-    sides = zip(group.jacobian, group.response, strict=True)
-    return functools.reduce(jnp.add, [block(jacobian[:, 0], response[:, 0]) for jacobian, response in sides])
+    turns, _, columns, worlds = group.bias.shape
+    jacobian, response = ([unstack(side[:, 0], 1) for side in sides] for sides in (group.jacobian, group.response))
+    of_points = point_responses(jacobian, response, group.table.together)
+    return jnp.moveaxis(of_points, 3, 1).reshape(turns, -1, columns, worlds)
 
 
 def _apart(group: _Group, present: Array) -> Array | None:
@@ -378,7 +367,7 @@ def _rigid_law(group: _Group, carries: Array, lasting: Array | None) -> Any:
 def _first_row(group: _Group, velocity: Array) -> Array:
     """``J v`` of the first row of each constraint: (turn, 1, column, world)."""
     rows = group.rows
-    return pgs.row_velocity(dataclasses.replace(rows, jacobian=tuple(side[:, :1] for side in rows.jacobian)), velocity)
+    return pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
 
 
 def _moved(group: _Group, displacement: Array, time: Array, dt: Array) -> Array:

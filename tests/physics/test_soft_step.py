@@ -1,7 +1,6 @@
 """The small-steps tier: stacks, friction, restitution, overlap, joints, other features, momentum, derivatives."""
 
 import dataclasses
-import functools
 import itertools
 
 import jax
@@ -13,6 +12,7 @@ from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, is_asleep, ro
 from tests.benchmarks.hard_scenes import chain, joint_gaps, overlapping_pyramid
 from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, check
 from tests.gradients.test_bounce_gradient import run as bounce
+from tests.gradients.test_slide_gradient import end_of_slide
 from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.physics.test_joint_drives import MASS, REST, STEPS, WEIGHT, of, oscillator
 from tests.scenes import (
@@ -351,29 +351,22 @@ def test_flight_is_exact(precision, gate):
 # Derivatives ---------------------------------------------------------------------------------------------------------
 
 
-@functools.partial(jax.jit, static_argnames="count")
-def end_of_slide(parameters, model, state, count):
-    model = dataclasses.replace(
-        model,
-        friction=jnp.full_like(model.friction, parameters["friction"]),
-        gravity=jnp.array([0.0, -1.0, 0.0]) * parameters["gravity"],
-    )
-    state = dataclasses.replace(state, velocity=state.velocity.at[1, 0].set(parameters["speed"]))
-    return rollout(model, state, count)[0].position[1, 0]
-
-
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_derivatives_of_a_slide_to_rest(precision, gate):
     model, state = slab_on_plane(options=soft_undamped())
-    values = {"speed": 2.0, "friction": 0.4, "gravity": GRAVITY}
+    values = {"speed": 2.0, "friction": 0.4, "mass": 1.0, "gravity": GRAVITY}
     values = {name: jnp.asarray(value) for name, value in values.items()}
-    reverse = jax.jit(jax.grad(end_of_slide), static_argnames="count")(values, model, state, count=45)
+
+    def place(values):
+        return end_of_slide(values, model, state, 45)[0]
+
+    reverse = jax.jit(jax.grad(place))(values)
     distance = 2.0**2 / (2 * 0.4 * GRAVITY)
     truth = {"speed": 2.0 / (0.4 * GRAVITY), "friction": -distance / 0.4, "gravity": -distance / GRAVITY}
     for name, value in truth.items():
         gate(f"d x / d {name} / truth - 1", float(reverse[name]) / value - 1, 0.01)
     if precision == "float64":
-        forward = jax.jit(jax.jacfwd(end_of_slide), static_argnames="count")(values, model, state, count=45)
+        forward = jax.jit(jax.jacfwd(place))(values)
         for name in truth:
             gate(f"forward against reverse, {name}", float(forward[name] / reverse[name]) - 1, 1e-9)
 
