@@ -26,7 +26,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver import tree
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import EMPTY
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
 from mathota_jax.struct import pytree, static
@@ -134,19 +134,24 @@ def _factorize(
     shifts = [_pack(dual, zero) for dual in duals[0]]
     turns = [_pack(_shift_of_turn(translations, duals[0], dual), dual) for dual in duals[1]]
     free = [*~found.held[3:], *~found.held[:3]]
-    columns: list[Array] = []
+    columns: list[tree.Pair] = []
     taken = np.zeros(len(found.links), int)
     for motion, flags in zip((*turns, *shifts), free, strict=True):
         flags[list(found.tree.floating)] = False
         for place in sorted({*taken[flags].tolist()}):
             here = flags & (taken == place)
             if place == len(columns):
-                columns.append(jnp.zeros_like(motion))
-            columns[place] = motion if here.all() else jnp.where(here[:, None, None], motion, columns[place])
+                columns.append(_pack(zero, zero))
+            columns[place] = jax.tree.map(
+                lambda new, old, here=here[:, None, None]: new if here.all() else jnp.where(here, new, old),
+                motion,
+                columns[place],
+            )
         taken += flags
     masses = tree.Masses(1.0 / inertia.inverse_mass, _moments(inertia))
-    stacked = jnp.stack(columns, axis=1) if columns else jnp.zeros((len(found.links), 0, 6, zero.x.shape[-1]))
-    return duals, tree.factorize(found.tree, masses, jnp.stack(offset), stacked.astype(zero.x.dtype))
+    none = jnp.zeros((len(found.links), 0, 3, zero.x.shape[-1]), zero.x.dtype)
+    stacked = jax.tree.map(lambda *parts: jnp.stack(parts, axis=1), *columns) if columns else (none, none)
+    return duals, tree.factorize(found.tree, masses, jnp.stack(offset), stacked)
 
 
 def _dual(rows: Any) -> tuple[Vec3, ...]:
@@ -170,9 +175,13 @@ def _moments(inertia: Inertia) -> Array:
     return jnp.stack([jnp.stack(inertia.apply(axis), axis=1) for axis in axes], axis=2)
 
 
-def _pack(linear: Vec3, angular: Vec3) -> Array:
-    """(link, 6, world)."""
-    return jnp.stack(jnp.broadcast_arrays(*linear, *angular), axis=1)
+def _pack(linear: Vec3, angular: Vec3) -> tree.Pair:
+    """Two of (link, 3, world)."""
+    return jnp.stack(linear, axis=1), jnp.stack(angular, axis=1)
+
+
+def _unpack(pair: tree.Pair) -> tuple[Vec3, Vec3]:
+    return Vec3(*unstack(pair[0], 1)), Vec3(*unstack(pair[1], 1))
 
 
 def rates(links: Links, velocity: Array) -> Impulses:
@@ -208,7 +217,7 @@ def solve(links: Links, wanted: Impulses) -> Impulses:
             for flags, change, impulse in zip(links.layout.held, changes, impulses, strict=True)
         )
 
-    worlds = max(leaf.shape[-1] for leaf in (*wanted, links.factors.columns, links.offset.x))
+    worlds = max(leaf.shape[-1] for leaf in (*wanted, links.factors.offset, links.offset.x))
     wanted = tuple(jnp.broadcast_to(values, (values.shape[0], worlds)) for values in wanted)
     return lax.custom_linear_solve(product, wanted, lambda _, right: _impulses(links, right), symmetric=True)
 
@@ -219,7 +228,7 @@ def _impulses(links: Links, wanted: Impulses) -> Impulses:
     turn = _combine(duals[1], wanted[3:])
     shift = _combine(duals[0], wanted[:3]) + _shift_of_turn(translations, duals[0], turn)
     force = tree.force_for(links.layout.tree, links.factors, _pack(shift, turn))
-    along, about = Vec3(*(force[:, k] for k in range(3))), Vec3(*(force[:, k] for k in range(3, 6)))
+    along, about = _unpack(force)
     linear = [dot(dual, along) for dual in duals[0]]
     for side, impulse in zip(translations, linear, strict=True):
         about = about - side.angular * impulse

@@ -139,17 +139,20 @@ def _grow(
     held: dict[int, tuple[tuple[int, ...], tuple[int, ...]]],
 ) -> None:
     """Adds the links of one tree."""
-    place_of = {GROUND: GROUND}
-    waiting = list(joints)
-    if all(GROUND not in ends[joint] for joint in joints):
+    grounded = [joint for joint in joints if GROUND in ends[joint]]
+    if grounded:
+        trunk = [(grounded[0], GROUND)]
+    else:
         first = min(block for joint in joints for block in ends[joint])
-        place_of = {first: len(links)}
         links.append(Link(first, GROUND))
-    while waiting:
-        joint = next(joint for joint in waiting if any(block in place_of for block in ends[joint]))
+        trunk = [(joint, len(links) - 1) for joint in reversed(joints) if first in ends[joint]]
+    waiting = set(joints)
+    while trunk:
+        # Depth first, see `solver.tree`.
+        joint, parent = trunk.pop()
         waiting.remove(joint)
-        parent, child = ends[joint]
-        is_child = parent in place_of
-        inner, outer = (parent, child) if is_child else (child, parent)
-        place_of[outer] = len(links)
-        links.append(Link(outer, place_of[inner], held[joint], is_child))
+        inner = GROUND if parent == GROUND else links[parent].block
+        is_child = ends[joint][0] == inner
+        outer = ends[joint][is_child]
+        links.append(Link(outer, parent, held[joint], is_child))
+        trunk += [(other, len(links) - 1) for other in reversed(joints) if other in waiting and outer in ends[other]]
