@@ -300,14 +300,17 @@ def _close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
         excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
         wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, errors)
         change = mechanism.push(links, mechanism.solve(links, wanted))
-        shift = mechanism.bounded(jnp.where(is_last, 0.0, change))
         linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
         assert angular is not None
-        return displace(moved._replace(velocity=linear, angular_velocity=angular), inertia, shift), None
+        moved = moved._replace(velocity=linear, angular_velocity=angular)
+        if not rounds:
+            return moved, None
+        shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism.bounded(change))
+        return displace(moved, inertia, shift), None
 
+    rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model)))
     moved = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), moved)
-    rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
     return lax.scan(close, moved, jnp.arange(rounds + 1) == rounds)[0]
 
 

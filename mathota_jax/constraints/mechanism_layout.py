@@ -51,6 +51,15 @@ class Layout:
         return Tree(tuple(link.parent for link in self.links), tuple(floating))
 
     @functools.cached_property
+    def floating_trees(self) -> tuple[tuple[int, ...], ...]:
+        """The links of each tree that hangs on nothing; those of a tree follow one another."""
+        starts = [place for place, link in enumerate(self.links) if link.parent == GROUND]
+        ends = [*starts[1:], len(self.links)]
+        return tuple(
+            tuple(range(a, b)) for a, b in zip(starts, ends, strict=True) if a in self.tree.floating
+        )
+
+    @functools.cached_property
     def slots(self) -> tuple[int, ...]:
         """All slots, in the order in which `held` says which impulse of which link they are."""
         return tuple(slot for link in self.links for rows in link.slots for slot in rows)
