@@ -295,7 +295,8 @@ def _close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
     def close(moved: Bodies, is_last: Array) -> tuple[Bodies, None]:
         inertia = moving_inertia(scene, model, moved.orientation)
         joints = joint_rows.joint_rows(model, merge(scene, bodies, moved))
-        links = mechanism.links(scene, joints, moved.position, inertia)
+        weights = jax.tree.map(lambda a, b: jnp.where(is_last, a, b), inertia, mechanism.correction_weights(inertia))
+        links = mechanism.links(scene, joints, moved.position, weights)
         velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
         excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
         wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, errors)

@@ -55,9 +55,7 @@ class Layout:
         """The links of each tree that hangs on nothing; those of a tree follow one another."""
         starts = [place for place, link in enumerate(self.links) if link.parent == GROUND]
         ends = [*starts[1:], len(self.links)]
-        return tuple(
-            tuple(range(a, b)) for a, b in zip(starts, ends, strict=True) if a in self.tree.floating
-        )
+        return tuple(tuple(range(a, b)) for a, b in zip(starts, ends, strict=True) if a in self.tree.floating)
 
     @functools.cached_property
     def slots(self) -> tuple[int, ...]:
@@ -83,8 +81,8 @@ class Layout:
 
 @functools.cache
 def layout(scene: Scene) -> Layout | None:
-    """The mechanisms of a scene; None where there is none, or where another solver takes care of the joints."""
-    if scene.options.solver == "soft_step":
+    """The mechanisms of a scene; None where there is none, or where joints are left to the solver."""
+    if scene.options.solver == "soft_step" or not scene.options.exact_joints:
         return None
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
     held = {

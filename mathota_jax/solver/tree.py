@@ -124,7 +124,9 @@ def force_for(tree: Tree, factors: Factors, jump: Pair) -> Pair:
     def gather(force: Pair, link: tuple) -> tuple[Pair, tuple]:
         across, columns, forces, compliance = link
         errors, whole = [], force
-        for column, reaction, free in zip(zip(*columns, strict=True), zip(*forces, strict=True), compliance, strict=True):
+        for column, reaction, free in zip(
+            zip(*columns, strict=True), zip(*forces, strict=True), compliance, strict=True
+        ):
             errors.append(_once(_inner(column, force) * free))
             force = _add_scaled(force, reaction, -errors[-1])
         left = jnp.stack(errors) if errors else compliance
@@ -178,7 +180,9 @@ def _inward(tree: Tree, visit: Visit, own: Any, links: Any) -> Any:
             total = jax.tree.map(lambda mine, theirs: mine + theirs[slot], total, left)
         passed, result = visit(*_once((total, link)))
         if slot_count:
-            left = jax.tree.map(lambda all, more: all.at[parent_slot].add(jnp.where(direct[0], 0.0, more)), left, passed)
+            left = jax.tree.map(
+                lambda all, more: all.at[parent_slot].add(jnp.where(direct[0], 0.0, more)), left, passed
+            )
         return (passed, left), result
 
     nothing = jax.tree.map(lambda x: jnp.zeros_like(x[0]), own)
@@ -218,10 +222,18 @@ def _schedule(tree: Tree) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     parents = np.array(tree.parents)
     direct = parents == np.arange(len(parents)) - 1
     direct[0] = False
-    branching = sorted({parent for parent, near in zip(tree.parents, direct, strict=True) if parent != GROUND and not near})
+    branching = sorted(
+        {parent for parent, near in zip(tree.parents, direct, strict=True) if parent != GROUND and not near}
+    )
     slots = {link: place for place, link in enumerate(branching)}
     slot = np.array([slots.get(link, len(slots)) for link in range(len(parents))], np.int32)
-    parent_slot = np.array([len(slots) if near else slots.get(parent, len(slots)) for parent, near in zip(tree.parents, direct, strict=True)], np.int32)
+    parent_slot = np.array(
+        [
+            len(slots) if near else slots.get(parent, len(slots))
+            for parent, near in zip(tree.parents, direct, strict=True)
+        ],
+        np.int32,
+    )
     return np.stack([direct, np.append(direct[1:], False)], axis=1), slot, parent_slot, len(branching)
 
 
