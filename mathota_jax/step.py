@@ -222,7 +222,7 @@ def _solve(
     hold = functools.partial(mechanism.hold, problem.held, problem.joint_rows)
     if covers(scene):
         return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
-    start, _ = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start)[::-1])
+    _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
     velocity, impulses, failed = _sweep(scene, rows, velocity, start)
     return *hold(velocity, impulses), failed
 

@@ -27,6 +27,7 @@ from mathota_jax.solver import tree
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
 from mathota_jax.struct import pytree, static
@@ -116,7 +117,8 @@ def _basis(found: Layout, joints: JointRows, like: Array) -> tuple[tuple[Side, .
     units = [Vec3(*(zero + float(axis == k) for axis in range(3))) for k in range(3)]
     linear = _complete([side.linear for side in rows[:3]], held[:3], units)
     angular = [
-        side.angular.map(lambda x, h=h: jnp.where(h, x, 0.0)) for side, h in zip(rows[:3], held[:3], strict=True)
+        Vec3(*(jnp.where(flags, x, 0.0) for x in side.angular))  # type: ignore[misc]
+        for side, flags in zip(rows[:3], held[:3], strict=True)
     ]
     rotations = _complete([side.angular for side in rows[3:]], held[3:], units)
     return tuple(Side(*pair) for pair in zip(linear, angular, strict=True)), tuple(rotations)
@@ -125,7 +127,7 @@ def _basis(found: Layout, joints: JointRows, like: Array) -> tuple[tuple[Side, .
 def _complete(rows: list[Any], held: list[np.ndarray], units: list[Vec3]) -> list[Vec3]:
     """Three independent directions of which the first are those that are held."""
     first, second, third = rows
-    counts = sum(flags.astype(int) for flags in held)
+    counts = np.sum(held, axis=0)
     if (counts == 3).all():
         return [first, second, third]
     found = units
@@ -171,8 +173,9 @@ def _dual(rows: Any) -> tuple[Vec3, ...]:
     """Vectors along which one of three directions is 1 and the others are 0."""
     first, second, third = rows
     volumes = (cross(second, third), cross(third, first), cross(first, second))
-    scale = 1.0 / dot(first, volumes[0])
-    return tuple(volume * scale for volume in volumes)
+    volume = dot(first, volumes[0])
+    scale = safe_divide(jnp.ones_like(volume), volume)
+    return tuple(side * scale for side in volumes)
 
 
 def _shift_of_turn(translations: tuple[Side, ...], duals: tuple[Vec3, ...], turn: Vec3) -> Vec3:
