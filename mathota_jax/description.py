@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
+from mathota_jax.constraints.mechanism_layout import layout
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -92,6 +93,7 @@ def _features(scene: Scene) -> list[str]:
         "friction": scene.friction and scene.slot_count > 0,
         "restitution": scene.restitution and scene.slot_count > 0,
         "joints": bool(scene.joints),
+        "exact joints": layout(scene) is not None,
         "gyroscopic torque": not all(scene.spherical[body] for body in scene.dynamic_bodies),
         "linear damping": options.linear_damping > 0,
         "angular damping": options.angular_damping > 0,

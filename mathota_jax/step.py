@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.batching import batch_last
 from mathota_jax.bodies import (
@@ -16,19 +17,21 @@ from mathota_jax.bodies import (
     moving_inertia,
     of_all_bodies,
     unpack,
+    unpack_blocks,
     vector,
 )
-from mathota_jax.constraints import contact, graph, joint, joint_rows, motor
+from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, motor
 from mathota_jax.constraints.lever import levers
+from mathota_jax.constraints.mechanism_layout import covers, layout
 from mathota_jax.constraints.problem import Problem, constrain, starting_impulses
 from mathota_jax.dynamics import events, sleep
-from mathota_jax.dynamics.free_motion import free_velocity
+from mathota_jax.dynamics.free_motion import carried_velocity, free_velocity
 from mathota_jax.dynamics.integrate import advance, displace
 from mathota_jax.model import Model
 from mathota_jax.outcome import forces, merge, new_state
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.pgs import Rows, add_impulses
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.spatial.vector import Vec3
@@ -145,21 +148,24 @@ def _simulate(model: Model, state: State, action: Array) -> State:
         return new_state(scene, state, moving(scene, bodies), {})
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
+    acting, carried = _acting_inertia(model, blocks, inertia)
     force, torque = _external(model, state, bodies, action)
-    free, decay = compute_once(_free(model, blocks, inertia, force, torque), state.position)
-    problem = constrain(model, state, bodies, blocks, inertia, free, _gravity(model), action)
+    free, decay = compute_once(_free(model, blocks, acting, carried, force, torque), state.position)
+    problem = constrain(model, state, bodies, blocks, acting, free, carried, _gravity(model), action)
     packed = contact.pack_motion(scene, *free)
-    start = starting_impulses(model, state, problem, inertia, packed)
+    start = starting_impulses(model, state, problem, acting, packed)
     lever, gained, failed = None, None, None
     if scene.options.solver == "soft_step":
         solved, gained, impulses = _small_steps(model, problem, blocks, packed, start)
     else:
         solved, impulses, failed = _solve(scene, problem, packed, start)
         lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
-    moved, displacement = advance(blocks, inertia, free, torque, decay, solved, lever, model.dt, gained)
+    moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, gained)
     moved, displacement = compute_once((moved, displacement), state.position)
     if scene.options.solver != "soft_step":
         moved = _correct_positions(model, problem, bodies, inertia, moved, displacement)
+    if problem.held is not None:
+        moved = _close_joints(model, bodies, moved)
     if scene.options.continuous and scene.pair_groups:
         moved = _stop_at_impacts(model, bodies, moved, displacement)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
@@ -178,12 +184,20 @@ def _external(model: Model, state: State, bodies: Bodies, action: Array) -> tupl
     return take((force, torque), model.scene.dynamic_bodies)
 
 
+def _acting_inertia(model: Model, blocks: Bodies, inertia: Inertia) -> tuple[Inertia, Vec3 | None]:
+    """Inertia with which bodies respond to impulses: with mechanisms that of mid-step; see `carried_velocity`."""
+    if layout(model.scene) is None or inertia.rotation is None:
+        return inertia, None
+    middle = inertia.at(joint_rows.moved_by(blocks, 0.5 * model.dt).orientation)
+    return compute_once((middle, carried_velocity(blocks, inertia, middle)), blocks.position.x)
+
+
 def _free(
-    model: Model, blocks: Bodies, inertia: Inertia, force: Vec3, torque: Vec3
+    model: Model, blocks: Bodies, inertia: Inertia, carried: Vec3 | None, force: Vec3, torque: Vec3
 ) -> tuple[tuple[Vec3, Vec3], float | Array]:
     """Phase 4: velocities at the end of the step without constraints; also the decay of the angular momentum."""
     options, dt = model.scene.options, model.dt
-    linear, angular = free_velocity(blocks, inertia, _gravity(model), force, torque, dt)
+    linear, angular = free_velocity(blocks, inertia, carried, _gravity(model), force, torque, dt)
     if options.linear_damping:
         linear = linear * jnp.maximum(1.0 - options.linear_damping * dt, 0.0)
     if not options.angular_damping:
@@ -203,6 +217,20 @@ def _solve(
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
+    if problem.held is None:
+        return _sweep(scene, rows, velocity, start)
+    hold = functools.partial(mechanism.hold, problem.held, problem.joint_rows)
+    if covers(scene):
+        return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
+    _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
+    velocity, impulses, failed = _sweep(scene, rows, velocity, start)
+    return *hold(velocity, impulses), failed
+
+
+def _sweep(
+    scene: Scene, rows: tuple[Rows, ...], velocity: Array, start: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...], Array | None]:
+    """All rows by the solver of the scene."""
     if scene.options.solver == "converged":
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
@@ -234,7 +262,7 @@ def _correct_positions(
     """Phase 7: sequential position correction (guide 10.2) by pseudo-impulses with the full effective mass."""
     scene = model.scene
     options = scene.options
-    if not options.position_iterations or not problem.rows:
+    if not options.position_iterations or not problem.rows or covers(scene):
         return moved
     packed = contact.pack_motion(scene, *displacement)
     rows: list[Rows] = []
@@ -255,6 +283,36 @@ def _correct_positions(
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
     return displace(moved, inertia, correction)
+
+
+def _close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
+    """Mechanisms at the end of the step: their joints closed, and velocities along which they stay closed.
+
+    The second is a projection in the metric of the kinetic energy, and so never adds any.
+    """
+    scene = model.scene
+
+    def close(moved: Bodies, is_last: Array) -> tuple[Bodies, None]:
+        inertia = moving_inertia(scene, model, moved.orientation)
+        joints = joint_rows.joint_rows(model, merge(scene, bodies, moved))
+        weights = jax.tree.map(lambda a, b: jnp.where(is_last, a, b), inertia, mechanism.correction_weights(inertia))
+        links = mechanism.links(scene, joints, moved.position, weights)
+        velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
+        excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
+        wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, errors)
+        change = mechanism.push(links, mechanism.solve(links, wanted))
+        linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
+        assert angular is not None
+        moved = moved._replace(velocity=linear, angular_velocity=angular)
+        if not rounds:
+            return moved, None
+        shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism.bounded(change))
+        return displace(moved, inertia, shift), None
+
+    rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model)))
+    moved = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), moved)
+    return lax.scan(close, moved, jnp.arange(rounds + 1) == rounds)[0]
 
 
 def _stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:

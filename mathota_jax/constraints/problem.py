@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia
+from mathota_jax.bodies import Bodies, Inertia, moving, of_all_bodies
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import (
     compact,
@@ -15,6 +15,8 @@ from mathota_jax.constraints import (
     joint,
     joint_layout,
     joint_rows,
+    mechanism,
+    mechanism_layout,
     row_coefficients,
     substep_rows,
     warm_start,
@@ -31,10 +33,11 @@ from mathota_jax.state import State
 class Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
 
-    `errors` are those of all groups, for the small steps alone.
+    `held` are the mechanisms at the middle of the step; `errors` are those of all groups, for the small steps alone.
     """
 
     joints: joint_rows.JointRows | None
+    held: mechanism.Links | None
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
@@ -53,16 +56,32 @@ def constrain(
     blocks: Bodies,
     inertia: Inertia,
     free: tuple[Vec3, Vec3],
+    carried: Vec3 | None,
     gravity: Vec3,
     action: Array,
 ) -> Problem:
-    """Phases 2, 3 and 5: narrow phase and rows."""
+    """Phases 2, 3 and 5: narrow phase and rows.
+
+    Args:
+      model, state: parameters and state.
+      bodies, blocks: all bodies and the moving ones at the start of the step.
+      inertia: with which the moving bodies respond to impulses.
+      free: their velocities at the end of the step without constraints.
+      carried: angular velocities at the middle of the step with the momentum of the start; None if they are the same.
+      gravity: components (1, world).
+      action: (motor, world).
+    """
     scene = model.scene
     small_steps = scene.options.solver == "soft_step"
-    joints, tables, errors = None, (), ()
+    joints, held, tables, errors = None, None, (), ()
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
-        middle = joint_rows.joint_rows(model, joint_rows.moved_by(bodies, 0.5 * model.dt))
+        halfway = joint_rows.moved_by(bodies, 0.5 * model.dt)
+        if carried is not None:
+            halfway = halfway._replace(angular_velocity=of_all_bodies(scene, carried))
+        middle = joint_rows.joint_rows(model, halfway)
+        if mechanism_layout.layout(scene) is not None:
+            held = mechanism.links(scene, middle, moving(scene, halfway).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
         rows_of = substep_rows.joint_rows if small_steps else joint.velocity_rows
@@ -97,7 +116,7 @@ def constrain(
         ]
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
-    return Problem(joints, tables, contacts, contact_rows, close, errors)
+    return Problem(joints, held, tables, contacts, contact_rows, close, errors)
 
 
 def starting_impulses(

@@ -22,7 +22,7 @@ PARTS = 16
 
 
 def free_velocity(
-    bodies: Bodies, inertia: Inertia, gravity: Vec3, force: Vec3, torque: Vec3, dt: Array
+    bodies: Bodies, inertia: Inertia, carried: Vec3 | None, gravity: Vec3, force: Vec3, torque: Vec3, dt: Array
 ) -> tuple[Vec3, Vec3]:
     """Velocities at the end of a step without constraint impulses or damping (guide 4.2, with the gyroscopic term).
 
@@ -32,13 +32,14 @@ def free_velocity(
 
     Args:
       bodies, inertia: moving bodies.
+      carried: angular velocities that already have the gyroscopic term, see `carried_velocity`; None where there are none.
       gravity: (1, world) components [m/s^2].
       force, torque: external, on each moving body, world frame.
       dt: time step [s].
     """
     linear = bodies.velocity + (gravity + force * inertia.inverse_mass) * dt
-    angular = bodies.angular_velocity
-    if inertia.rotation is not None:
+    angular = bodies.angular_velocity if carried is None else carried
+    if inertia.rotation is not None and carried is None:
         momentum = inertia.apply(angular)
         gyroscopic = cross(momentum, angular) * dt
         turned = inertia.solve(gyroscopic)
@@ -47,6 +48,22 @@ def free_velocity(
         scale = jnp.where(total > 0, safe_sqrt(safe_divide(before, total)), 1.0)
         angular = (angular + turned) * scale
     return linear, angular + inertia.solve(torque) * dt
+
+
+def carried_velocity(bodies: Bodies, start: Inertia, middle: Inertia) -> Vec3:
+    """Angular velocities at the middle of the step that have the momentum, and the energy, of its start.
+
+    A row of the middle of the step needs the inertia of that moment too: a torque across a thin rod, seen from where the
+    rod was, has a part along it, where the moment is thousands of times less.
+
+    Args:
+      bodies: moving bodies at the start.
+      start, middle: their inertia then and half a step later.
+    """
+    momentum = start.apply(bodies.angular_velocity)
+    carried = middle.solve(momentum)
+    energy, found = dot(bodies.angular_velocity, momentum), dot(carried, momentum)
+    return carried * jnp.where(found > 0, safe_sqrt(safe_divide(energy, found)), 1.0)
 
 
 def rotate_at_constant_momentum(

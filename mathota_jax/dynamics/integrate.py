@@ -17,6 +17,7 @@ from mathota_jax.spatial.vector import Vec3, dot
 def advance(
     bodies: Bodies,
     inertia: Inertia,
+    acting: Inertia,
     free: tuple[Vec3, Vec3],
     torque: Vec3,
     decay: float | Array,
@@ -32,6 +33,7 @@ def advance(
 
     Args:
       bodies, inertia: moving bodies at the start of the step.
+      acting: inertia with which they responded to the impulses.
       free: linear and angular velocity at the end of the step without constraints.
       torque: external torque, world frame.
       decay: factor by which damping reduces the angular momentum in this step.
@@ -54,7 +56,7 @@ def advance(
     end = (start + torque * dt) * decay
     mean = (start + end) * 0.5
     if solved_angular is not None:
-        change = inertia.apply(solved_angular - free_angular)
+        change = acting.apply(solved_angular - free_angular)
         end = end + change
         if gained_angular is not None:
             mean = mean + inertia.apply(gained_angular) / dt
@@ -72,7 +74,7 @@ def advance(
         # One refinement: round-off of the solve alone drifts (measured: 1.2e-4 of the momentum in 1000 float32 steps).
         angular = angular + jax.lax.stop_gradient(turned.solve(end - turned.apply(angular)))
         angular = angular * _energy_scale(
-            inertia, free_angular if solved_angular is None else solved_angular, angular, end, turn
+            acting, free_angular if solved_angular is None else solved_angular, angular, end, turn
         )
         turn = inertia.rotation.apply(turn)
     moved = Bodies(bodies.position + shift, orientation, solved_linear, angular)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Hinge, SceneBuilder, Sphere
+from mathota_jax import BallAndSocket, Box, Hinge, SceneBuilder, Sphere
 from tests.scenes import DOWN, invariants, motion, record_worlds, repeat, rotation_matrix, undamped
 
 SOLVERS = {"default": {}, "converged": {"solver": "converged"}}
@@ -22,8 +22,8 @@ TIPS = {
 }
 
 
-def chain(links, thickness=None, **options):
-    """A chain 1 m long of 1 kg, hinged at the origin, level.
+def chain(links, thickness=None, tip_mass=0.0, **options):
+    """A chain 1 m long of 1 kg, hinged at the origin, level; with a `tip_mass` [kg], a point mass at its end.
 
     The motion is plane: a ball with the moment of a thin rod, ``m l^2 / 12``, moves as the rod does. With a `thickness`
     [fraction of the length] the links are boxes.
@@ -37,6 +37,9 @@ def chain(links, thickness=None, **options):
         body = builder.add_body(shape, mass=1 / links, position=((link + 0.5) * length, 0, 0), collides=False)
         builder.add_joint(Hinge(last, body, (link * length, 0, 0), (0, 0, 1)))
         last = body
+    if tip_mass:
+        end = builder.add_body(Sphere(0.02), mass=tip_mass, position=(1.0, 0, 0), collides=False)
+        builder.add_joint(BallAndSocket(last, end, (1.0, 0, 0)))
     return builder.build(undamped(**options))
 
 
@@ -90,6 +93,56 @@ def test_short_chains_swing_as_they_should(float64, links, gate):
     gate("tip at 0.5 s [m]", tip[479, :2] - TIPS[links][0], 2e-3)
     gate("tip at 1 s [m]", tip[959, :2] - TIPS[links][1], 4e-3)
     gate("energy / swing energy", energy, 2e-3)
+
+
+def test_chain_with_a_heavy_end(precision, gate):
+    """Benchmark A5, variant H: 10 kg at the end of 20 links of 50 g; MuJoCo's implicit integrator is NaN at 1/100 s."""
+    model, state = chain(20, tip_mass=10.0, dt=1 / 240)
+    _, record = record_worlds(repeat(model, 1), repeat(state, 1), 240, motion)
+    position = np.asarray(record["position"], dtype=float)[:, 0]
+    half = rotation_matrix(record["orientation"][:, 0])[..., :, 0] * 0.025
+    gaps = np.linalg.norm(position[:, 2:21] - half[:, 2:21] - position[:, 1:20] - half[:, 1:20], axis=-1)
+    gate("largest gap / link", gaps * 20, 1e-4)
+    gate(
+        "largest gap at the end / link",
+        np.linalg.norm(position[:, 20] + half[:, 20] - position[:, 21], axis=-1) * 20,
+        1e-4,
+    )
+    gate("end at 0.5 s [m]", position[119, 21, :2] - (0.37298612, -0.92743830), 5e-3)
+    gate("end at 1 s [m]", position[239, 21, :2] - (-0.98749542, -0.15169382), 5e-2)
+
+
+QUICK_CASES = [(20, None, 60), (10, 0.05, 60)]
+SLOW_CASES = [
+    (links, thickness, rate)
+    for links in (5, 10, 20)
+    for thickness in (None, 0.2, 0.05)
+    for rate in (60, 120, 240)
+    if (links, thickness, rate) not in QUICK_CASES
+]
+
+
+@pytest.mark.parametrize(
+    ("links", "thickness", "rate"),
+    [*QUICK_CASES, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW_CASES)],
+)
+def test_passive_chains_gain_no_energy(links, thickness, rate, gate):
+    """Four chains pushed at random, out of their plane too."""
+    model, state = chain(links, thickness, dt=1 / rate)
+    states = repeat(state, 4)
+    push = 3.0 * np.random.default_rng(0).normal(size=(4, links, 3))
+    spin = states.angular_velocity.at[:, 1:].add(jnp.asarray(push, state.velocity.dtype))
+    states = dataclasses.replace(states, angular_velocity=spin)
+    _, record = record_worlds(repeat(model, 4), states, 2 * rate, motion)
+    record = {name: np.asarray(values, dtype=float)[:, :, 1:] for name, values in record.items()}
+    leaves = {"mass": model.mass[1:], "inertia": model.inertia[1:]}
+    order = ("position", "orientation", "velocity", "angular_velocity")
+    energy = invariants(leaves, *(record[name] for name in order))[0] + 9.81 / links * record["position"][..., 1].sum(
+        -1
+    )
+    assert np.isfinite(energy).all()
+    gate("energy gained / swing energy", np.maximum(energy - energy[0], 0.0) / 4.905, 2e-3)
+    gate("energy left: it swings", -np.minimum((energy - energy[0]) / 4.905, 0.0), 1.0)
 
 
 def test_four_bar_loop(precision, gate):

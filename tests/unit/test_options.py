@@ -19,6 +19,7 @@ DEFAULTS = {
     "broadphase": "auto",
     "pair_capacity": None,
     "solver": "pgs",
+    "exact_joints": True,
     "substeps": None,
 }
 OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}

@@ -72,6 +72,7 @@ KIND = JointKind(
     BallAndSocket,
     point_rows,
     3,
+    3,
     Coordinate(twist, twist_sides, angular=True, curved=True),
     rotation_axes,
     3,

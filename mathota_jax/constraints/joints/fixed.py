@@ -30,4 +30,4 @@ def fixed_rows(frames: JointFrames) -> list[JointRow]:
     return [*point_rows(frames), *orientation_rows(frames)]
 
 
-KIND = JointKind(Fixed, fixed_rows, 6)
+KIND = JointKind(Fixed, fixed_rows, 6, 3)

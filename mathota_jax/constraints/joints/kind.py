@@ -34,6 +34,7 @@ class JointKind(NamedTuple):
       declaration: class that users pass to `SceneBuilder.add_joint`.
       fixed_rows: rows of the motions that the joint forbids.
       fixed_row_count: their number.
+      fixed_translations: how many of them, the first ones, hold translations; the others hold rotations.
       coordinate: that limits act on, and springs and motors if it is the joint's only freedom; None for none.
       free_sides: Jacobians of the motions that damping and dry friction resist.
       free_count: their number.
@@ -43,6 +44,7 @@ class JointKind(NamedTuple):
     declaration: type
     fixed_rows: Callable[[JointFrames], list[JointRow]]
     fixed_row_count: int
+    fixed_translations: int
     coordinate: Coordinate | None = None
     free_sides: Callable[[JointFrames], list[Sides]] = lambda frames: []
     free_count: int = 0
@@ -58,7 +60,16 @@ def scalar_kind(
     declaration: type,
     fixed_rows: Callable[[JointFrames], list[JointRow]],
     fixed_row_count: int,
+    fixed_translations: int,
     coordinate: Coordinate,
 ) -> JointKind:
     """A kind whose only freedom, or only interest, is one coordinate."""
-    return JointKind(declaration, fixed_rows, fixed_row_count, coordinate, lambda frames: [coordinate.sides(frames)], 1)
+    return JointKind(
+        declaration,
+        fixed_rows,
+        fixed_row_count,
+        fixed_translations,
+        coordinate,
+        lambda frames: [coordinate.sides(frames)],
+        1,
+    )

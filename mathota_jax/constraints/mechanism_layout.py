@@ -1,0 +1,165 @@
+"""Which bodies of a scene are links of mechanisms, found when the scene is traced."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from mathota_jax.constraints.joint_layout import JointGroup, joint_groups, joint_row_count
+from mathota_jax.scene import Scene
+from mathota_jax.solver.tree import GROUND, Tree
+
+LEAST_JOINTS = 3
+"""Joints of the smallest mechanism: two converge in a few sweeps, which are cheaper."""
+
+
+class Link(NamedTuple):
+    """A body of a mechanism.
+
+    Attributes:
+      block: its velocity block.
+      parent: place of its parent among the links, `GROUND` for none.
+      slots: of the rows that hold translations, and of those that hold rotations, relative to the parent.
+      is_child: whether the joint, too, calls it the child.
+    """
+
+    block: int
+    parent: int
+    slots: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
+    is_child: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """The links of all mechanisms of a scene, parents first."""
+
+    links: tuple[Link, ...]
+    block_count: int
+
+    @functools.cached_property
+    def blocks(self) -> tuple[int, ...]:
+        """Velocity block of each link."""
+        return tuple(link.block for link in self.links)
+
+    @functools.cached_property
+    def tree(self) -> Tree:
+        """The links as the solver sees them."""
+        floating = (place for place, link in enumerate(self.links) if link.parent == GROUND and not any(link.slots))
+        return Tree(tuple(link.parent for link in self.links), tuple(floating))
+
+    @functools.cached_property
+    def floating_trees(self) -> tuple[tuple[int, ...], ...]:
+        """The links of each tree that hangs on nothing; those of a tree follow one another."""
+        starts = [place for place, link in enumerate(self.links) if link.parent == GROUND]
+        ends = [*starts[1:], len(self.links)]
+        return tuple(tuple(range(a, b)) for a, b in zip(starts, ends, strict=True) if a in self.tree.floating)
+
+    @functools.cached_property
+    def slots(self) -> tuple[int, ...]:
+        """All slots, in the order in which `held` says which impulse of which link they are."""
+        return tuple(slot for link in self.links for rows in link.slots for slot in rows)
+
+    @functools.cached_property
+    def held(self) -> np.ndarray:
+        """(6, link) which of the three translations and three rotations of each link are held."""
+        return np.array([[row < len(link.slots[part]) for link in self.links] for part in range(2) for row in range(3)])
+
+    @functools.cached_property
+    def row_slots(self) -> np.ndarray:
+        """(6, link) slot of each; any one where nothing is held."""
+        return np.array(
+            [
+                [link.slots[part][row] if row < len(link.slots[part]) else self.slots[0] for link in self.links]
+                for part in range(2)
+                for row in range(3)
+            ]
+        )
+
+
+@functools.cache
+def layout(scene: Scene) -> Layout | None:
+    """The mechanisms of a scene; None where there is none, or where joints are left to the solver."""
+    if scene.options.solver == "soft_step" or not scene.options.exact_joints:
+        return None
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    held = {
+        joint: _held_slots(group, place) for group in joint_groups(scene) for place, joint in enumerate(group.joints)
+    }
+    ends = {
+        joint: tuple(block_of.get(body, GROUND) for body in (scene.joints[joint].parent, scene.joints[joint].child))
+        for joint, slots in held.items()
+        if any(slots)
+    }
+    links: list[Link] = []
+    for joints in _components(ends, len(block_of)):
+        grounded = sum(GROUND in ends[joint] for joint in joints)
+        bodies = {block for joint in joints for block in ends[joint]} - {GROUND}
+        if len(joints) >= LEAST_JOINTS and grounded <= 1 and len(joints) == len(bodies) - 1 + grounded:
+            _grow(links, joints, ends, held)
+    return Layout(tuple(links), len(block_of)) if links else None
+
+
+def covers(scene: Scene) -> bool:
+    """Whether the scene has no other rows than those that mechanisms hold."""
+    found = layout(scene)
+    return found is not None and not scene.slot_count and len(found.slots) == joint_row_count(scene)
+
+
+def _held_slots(group: JointGroup, place: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Slots of the rows of a joint that hold translations, and rotations, whatever happens."""
+    kind, row = group.kind, group.kind.fixed_row_count
+    rows: tuple[list[int], list[int]] = ([*range(kind.fixed_translations)], [*range(kind.fixed_translations, row)])
+    for feature in group.features:
+        if feature == "locked":
+            assert kind.coordinate is not None
+            rows[kind.coordinate.angular].append(row)
+        row += kind.free_count if feature in ("damping", "friction") else 1
+    translations, rotations = (tuple(group.slots(row).start + place for row in part) for part in rows)
+    return translations, rotations
+
+
+def _components(ends: dict[int, tuple[int, ...]], block_count: int) -> list[list[int]]:
+    """Joints that are connected through moving bodies."""
+    label = list(range(block_count))
+
+    def root(block: int) -> int:
+        while label[block] != block:
+            block = label[block]
+        return block
+
+    for blocks in ends.values():
+        if GROUND not in blocks:
+            label[root(blocks[0])] = root(blocks[1])
+    found: dict[int, list[int]] = {}
+    for joint, blocks in ends.items():
+        found.setdefault(root(max(blocks)), []).append(joint)
+    return list(found.values())
+
+
+def _grow(
+    links: list[Link],
+    joints: list[int],
+    ends: dict[int, tuple[int, ...]],
+    held: dict[int, tuple[tuple[int, ...], tuple[int, ...]]],
+) -> None:
+    """Adds the links of one tree."""
+    grounded = [joint for joint in joints if GROUND in ends[joint]]
+    if grounded:
+        trunk = [(grounded[0], GROUND)]
+    else:
+        first = min(block for joint in joints for block in ends[joint])
+        links.append(Link(first, GROUND))
+        trunk = [(joint, len(links) - 1) for joint in reversed(joints) if first in ends[joint]]
+    waiting = set(joints)
+    while trunk:
+        # Depth first, see `solver.tree`.
+        joint, parent = trunk.pop()
+        waiting.remove(joint)
+        inner = GROUND if parent == GROUND else links[parent].block
+        is_child = ends[joint][0] == inner
+        outer = ends[joint][is_child]
+        links.append(Link(outer, parent, held[joint], is_child))
+        trunk += [(other, len(links) - 1) for other in reversed(joints) if other in waiting and outer in ends[other]]

@@ -1,0 +1,127 @@
+"""Trees of joints solved in linear time, against the dense matrix of their rows."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import BallAndSocket, Box, Distance, Fixed, Hinge, SceneBuilder, Slider, Sphere
+from mathota_jax.bodies import moving, moving_inertia, unpack
+from mathota_jax.constraints import mechanism
+from mathota_jax.constraints.joint_rows import joint_rows
+from mathota_jax.constraints.mechanism_layout import covers, layout
+from tests.scenes import undamped
+
+ANCHOR, AXIS = (0.3, 0.2, 0.1), (0.2, 0.5, 1.0)
+
+
+def joined(kinds, parents, grounded, reverse=()):
+    """Boxes of unlike masses, body 1 on the ground or free; joint k leads to body k + 2 from `parents[k]`."""
+    generator = np.random.default_rng(len(kinds))
+    builder = SceneBuilder()
+    ground = builder.add_body(Sphere(0.1), static=True, collides=False)
+    for _ in range(len(kinds) + 1):
+        half = tuple(generator.uniform(0.05, 0.5, 3))
+        place = tuple(generator.normal(size=3))
+        builder.add_body(Box(half), mass=10 ** generator.uniform(-1, 1), position=place, collides=False)
+    if grounded:
+        builder.add_joint(Hinge(ground, 1, ANCHOR, AXIS))
+    for joint, (kind, parent) in enumerate(zip(kinds, parents, strict=True)):
+        ends = (joint + 2, parent) if joint in reverse else (parent, joint + 2)
+        builder.add_joint(kind(*ends, ANCHOR, AXIS) if kind in (Hinge, Slider) else kind(*ends, ANCHOR))
+    return builder.build(undamped())
+
+
+CASES = {
+    "chain": joined([Hinge] * 4, [1, 2, 3, 4], True),
+    "floating chain": joined([Hinge] * 3, [1, 2, 3], False),
+    "all kinds": joined([BallAndSocket, Slider, Fixed, Distance, Hinge], [1, 2, 3, 4, 5], True),
+    "branches": joined([Hinge, BallAndSocket, Hinge, Hinge, Slider, Hinge], [1, 1, 2, 2, 1, 4], False),
+    "joints that call the link their parent": joined([Hinge, BallAndSocket, Slider], [1, 2, 2], True, (0, 2)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_impulses_are_those_of_the_dense_matrix(float64, case, gate):
+    """At poses at which the joints are broken too, in two worlds."""
+    model, state = jax.tree.map(lambda x: x.astype(jnp.result_type(float)) if x.dtype.kind == "f" else x, CASES[case])
+    scene = model.scene
+    generator = np.random.default_rng(5)
+    broken = 0.1 * generator.normal(size=(2, *state.orientation.shape))
+    turned = jnp.asarray(state.orientation + broken)
+    turned = turned / jnp.linalg.norm(turned, axis=-1, keepdims=True)
+    states = jax.tree.map(lambda x: jnp.stack([x, x], axis=-1), state)
+    states = dataclasses.replace(states, orientation=jnp.moveaxis(turned, 0, -1))
+    worlds_last = jax.tree.map(lambda x: x[..., None], model)
+    bodies = unpack(states)
+    joints = joint_rows(worlds_last, bodies)
+    blocks = moving(scene, bodies)
+    inertia = moving_inertia(scene, worlds_last, blocks.orientation)
+    found = layout(scene)
+    assert found is not None and covers(scene)
+    links = mechanism.links(scene, joints, blocks.position, inertia)
+
+    rows, count = joints.error.shape[0], len(scene.dynamic_bodies)
+    wanted = generator.normal(size=(rows, 2))
+    impulses = mechanism.solve(links, mechanism.of_slots(links, jnp.asarray(wanted)))
+    change = np.asarray(mechanism.push(links, impulses))
+    solved = np.asarray(mechanism.to_slots(links, impulses, rows))
+    ends = {}
+    for link in found.links:
+        for slot in (*link.slots[0], *link.slots[1]):
+            parent = found.links[link.parent].block if link.parent >= 0 else None
+            ends[slot] = (link.block, parent) if link.is_child else (parent, link.block)
+    for world in range(2):
+        jacobian = np.zeros((rows, 6 * count))
+        for slot, (child, parent) in ends.items():
+            for block, side in ((child, joints.child), (parent, joints.parent)):
+                if block is not None:
+                    values = [np.broadcast_to(x, (rows, 2))[slot, world] for x in jax.tree.leaves(side)]
+                    jacobian[slot, 6 * block : 6 * block + 6] = values
+        inverse = np.zeros((6 * count, 6 * count))
+        for block in range(count):
+            mass = float(model.mass[scene.dynamic_bodies[block]])
+            axes = np.array([np.asarray(x)[block, world] for x in jax.tree.leaves(inertia.rotation)]).reshape(3, 3).T
+            moments = np.asarray(model.inertia)[scene.dynamic_bodies[block]]
+            start = 6 * block
+            inverse[start : start + 3, start : start + 3] = np.eye(3) / mass
+            inverse[start + 3 : start + 6, start + 3 : start + 6] = axes @ np.diag(1 / moments) @ axes.T
+        truth = np.linalg.solve(jacobian @ inverse @ jacobian.T, wanted[:, world])
+        scale = np.abs(truth).max()
+        gate("impulse", (solved[:, world] - truth) / scale, 1e-9)
+        moved = inverse @ jacobian.T @ truth
+        gate("velocity", (change[:, :, world].T.reshape(-1) - moved) / np.abs(moved).max(), 1e-9)
+
+
+def test_which_joints_are_links():
+    """Loops, pairs and joints without a row that holds are left to the solver."""
+
+    def count(build, **options):
+        builder = SceneBuilder()
+        ground = builder.add_body(Sphere(0.1), static=True, collides=False)
+        for place in range(4):
+            builder.add_body(Sphere(0.1), mass=1.0, position=(place + 1.0, 0, 0), collides=False)
+        build(builder, ground)
+        found = layout(builder.build(undamped(**options))[0].scene)
+        return 0 if found is None else len(found.links)
+
+    def chain(length, last=None):
+        def build(builder, ground):
+            for place in range(length):
+                builder.add_joint(Hinge(place, place + 1, (place + 0.5, 0, 0), (0, 0, 1)))
+            if last:
+                last(builder, ground)
+
+        return build
+
+    assert count(chain(2)) == 0
+    assert count(chain(3)) == 3
+    assert count(chain(4)) == 4
+    assert count(chain(4), exact_joints=False) == 0
+    assert count(chain(4), solver="soft_step") == 0
+    assert count(chain(4, lambda builder, ground: builder.add_joint(Hinge(4, ground, (4.5, 0, 0), (0, 0, 1))))) == 0
+    rope = Distance(2, 4, anchor=(2, 0, 0), lengths=(0, 5))
+    assert count(chain(2, lambda builder, ground: builder.add_joint(rope))) == 0
+    assert count(chain(3, lambda builder, ground: builder.add_joint(rope))) == 3
