@@ -83,6 +83,7 @@ class Options:
     solver: str = "pgs"
     substeps: int | None = None
     continuous: bool = False
+    impact_events: int = 0
     sleep: bool = False
     sleep_velocity: float = 0.05
     sleep_angular_velocity: float = 0.05
@@ -91,7 +92,12 @@ class Options:
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and self.dt > 0):
             raise ValueError(f"Options.dt must be a positive finite number of seconds, got {self.dt!r}")
-        for name, minimum in (("velocity_iterations", 1), ("position_iterations", 0), *OPTIONAL):
+        for name, minimum in (
+            ("velocity_iterations", 1),
+            ("position_iterations", 0),
+            ("impact_events", 0),
+            *OPTIONAL,
+        ):
             value = getattr(self, name)
             optional = (name, minimum) in OPTIONAL and value is None
             if not optional and not (isinstance(value, int) and not isinstance(value, bool) and value >= minimum):
@@ -119,6 +125,13 @@ class Options:
             raise ValueError(
                 f"Options.substeps = {self.substeps} needs solver='soft_step', got solver={self.solver!r}; "
                 "for smaller steps of this solver divide dt instead"
+            )
+        if self.impact_events and self.solver == "soft_step":
+            raise ValueError("Options.impact_events needs solver='pgs' or 'converged', got solver='soft_step'")
+        if self.impact_events and (self.continuous or self.sleep):
+            raise ValueError(
+                f"Options.impact_events = {self.impact_events} can not be combined with continuous={self.continuous}, "
+                f"sleep={self.sleep}; switch these off"
             )
         if self.broadphase not in BROADPHASE_CHOICES:
             known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
