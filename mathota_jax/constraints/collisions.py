@@ -32,6 +32,7 @@ from mathota_jax.solver.laws import Cone
 from mathota_jax.solver.pgs import Rows
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
 
@@ -43,7 +44,8 @@ Impulses = tuple[Array, ...]
 
 def pair_restitution(model: Model) -> Array:
     """(slot, world) of the slots that belong to a pair: the smaller of the two coefficients (guide 8.2)."""
-    return jnp.minimum(*(take(model.restitution, np.asarray(side)) for side in model.scene.slot_bodies))
+    smaller = jnp.minimum(*(take(model.restitution, np.asarray(side)) for side in model.scene.slot_bodies))
+    return jnp.broadcast_to(smaller, (model.scene.static_slot_count, smaller.shape[-1]))
 
 
 def foreseen(
@@ -165,17 +167,31 @@ def _rounds(
 
     def solve(state: tuple[Array, Impulses]) -> tuple[Array, Impulses]:
         velocity, total = state
-        rows = list(held)
+        rows, rebounds = list(held), [jnp.zeros_like(row.bias) for row in held]
         for group, e in zip(groups, bounce, strict=True):
             speed = pgs.first_row_velocity(group.rows.table, group.rows.jacobian, None, velocity)
-            rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), -e * speed, 0.0)
-            approaching = _approach(group.rows, velocity) > least
-            chosen = without(group.rows, ~approaching)
-            bias = jnp.concatenate([-rebound, jnp.zeros_like(chosen.bias[:, 1:])], axis=1)
-            rows.append(dataclasses.replace(chosen, bias=bias))
+            rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), e * speed, 0.0)
+            chosen = without(group.rows, _approach(group.rows, velocity) <= least)
+            zero = jnp.zeros_like(chosen.bias)
+            rebounds.append(jnp.concatenate([rebound, zero[:, 1:]], axis=1))
+            rows.append(dataclasses.replace(chosen, bias=zero))
         start = tuple(jnp.zeros_like(part) for part in total)
         gradient = scene.options.gradient_iterations or 2 * iterations
-        velocity, impulses = pgs.solve(iterations, gradient, tuple(rows), velocity, start)
+
+        def with_restitution(share: Array | float) -> Impulses:
+            biased = tuple(
+                dataclasses.replace(row, bias=row.bias + share * rebound)
+                for row, rebound in zip(rows, rebounds, strict=True)
+            )
+            return pgs.solve(iterations, gradient, biased, velocity, start)[1]
+
+        if scene.friction:
+            both = lax.map(with_restitution, jnp.array([0.0, 1.0], velocity.dtype))
+            stopping, full = (tuple(part[k] for part in both) for k in range(2))
+            impulses = _without_gain(tuple(rows), velocity, stopping, full)
+        else:
+            impulses = with_restitution(1.0)
+        velocity = pgs.add_impulses(tuple(rows), velocity, impulses)
         return velocity, tuple(a + b for a, b in zip(total, impulses, strict=True))
 
     def approaches(velocity: Array) -> Array:
@@ -191,6 +207,29 @@ def _rounds(
     start = tuple(jnp.zeros((*rows.bias.shape[:-1], worlds), before.dtype) for rows in everything)
     (velocity, impulses), _ = lax.scan(one_round, (before, start), None, length=ROUNDS)
     return velocity, held, groups, impulses
+
+
+def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, full: Impulses) -> Impulses:
+    """As much of the restitution as gains no energy.
+
+    With friction Newton's restitution can (T. R. Kane, D. A. Levinson, "Dynamics: Theory and Applications", 1985); an
+    impact without it never does, and between the two sets of impulses the energy is a parabola.
+    """
+    difference = tuple(b - a for a, b in zip(stopping, full, strict=True))
+    stopped = pgs.add_impulses(rows, velocity, stopping)
+    at_end = pgs.add_impulses(rows, velocity, full)
+    zero = jnp.zeros(velocity.shape[-1], velocity.dtype)
+    lost, slope, bend = zero, zero, zero
+    for group, first, more in zip(rows, stopping, difference, strict=True):
+        before, middle, after = (pgs.row_velocity(group, v) for v in (velocity, stopped, at_end))
+        lost = lost - 0.5 * (first * (before + middle)).sum((0, 1, 2))
+        slope = slope + (more * middle).sum((0, 1, 2))
+        bend = bend + (more * (after - middle)).sum((0, 1, 2))
+    gains = settle(jnp.where(slope + 0.5 * bend > lost, 1.0, 0.0)) > 0.5
+    lost = jnp.maximum(lost, 0.0)
+    root = safe_sqrt(jnp.where(gains, jnp.maximum(slope * slope + 2.0 * bend * lost, 0.0), 1.0))
+    share = jnp.where(gains, jnp.clip(safe_divide(2.0 * lost, slope + root), 0.0, 1.0), 1.0)
+    return tuple(first + share * more for first, more in zip(stopping, difference, strict=True))
 
 
 def _approach(rows: Rows, velocity: Array) -> Array:

@@ -48,8 +48,12 @@ class FirstImpact(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """State of the search for one group, (pair, world): no touch before `low`, one before `high`."""
+    """State of the search for one group, (pair, world): no touch before `low`, one before `high`.
 
+    `level` is the gap that counts as touching: 0, or that of bodies that overlap from the start.
+    """
+
+    level: Array
     time: Array
     low: Array
     high: Array
@@ -106,8 +110,8 @@ def _search(
     shape = (count, wanted.shape[-1])
     end = jnp.broadcast_to(end, shape)
 
-    def look(time: Array, level: Array | float) -> tuple[Array, Array, Array, Array]:
-        """At a time: step to the next touch; gap of the deepest point; rate of its approach; whether there is an impact."""
+    def look(time: Array, level: Array, first: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """At a time: level; step to the next touch; gap and rate of the deepest point; whether there is an impact."""
         (one, _), (other, _) = a.at(time), b.at(time)
         found = contacts_between(model, group, one[:2], other[:2])
         spin_a, spin_b = norm(one.angular_velocity), norm(other.angular_velocity)
@@ -120,6 +124,7 @@ def _search(
         columns = [
             _by_point(component, count, shape) for component in (*found.position, *found.normal, found.separation)
         ]
+        seen = []
         for x, y, z, n_x, n_y, n_z, separation, active in zip(
             *columns, _by_point(found.active, count, shape), strict=True
         ):
@@ -127,18 +132,20 @@ def _search(
             velocity = other.velocity + cross(other.angular_velocity, point - other.position)
             velocity = velocity - one.velocity - cross(one.angular_velocity, point - one.position)
             rate = dot(normal, velocity)
-            gap = separation - level
             rests_here = (separation <= TOUCHING * size) & (jnp.abs(rate) * rebound <= rests)
-            counts = active & ~rests_here
-            bend = dot(normal, acceleration) - swing
+            seen.append((active & ~rests_here, separation, rate, dot(normal, acceleration) - swing))
+        overlap = jnp.minimum(0.0, jnp.stack([jnp.where(counts, gap, 0.0) for counts, gap, *_ in seen]).min(0))
+        level = jnp.where(first, overlap, level)
+        for counts, separation, rate, bend in seen:
+            gap = separation - level
             step = jnp.minimum(step, jnp.where(counts, _next_touch(gap, rate, bend, near), jnp.inf))
             deeper = counts & (gap < deepest)
             deepest, rate_there = jnp.where(deeper, gap, deepest), jnp.where(deeper, rate, rate_there)
             impact = impact | (counts & (gap <= near) & (rate < 0))
-        return step, deepest, rate_there, impact
+        return level, step, deepest, rate_there, impact
 
-    def advance(state: _Search, level: Array) -> _Search:
-        step, gap, rate, impact = look(state.time, level)
+    def advance(state: _Search) -> _Search:
+        level, step, gap, rate, impact = look(state.time, state.level, state.count == 0)
         inside = settle(jnp.where((gap < -near) & (state.time > 0), 1.0, 0.0)) > 0.5
         touches = settle(jnp.where(impact & ~inside, 1.0, 0.0)) > 0.5
         low = jnp.where(inside, state.low, state.time)
@@ -150,6 +157,7 @@ def _search(
         left = (time <= end) & (time > low)
         going = state.going & ~touches & left
         return _Search(
+            level,
             jnp.where(going, time, state.time),
             jnp.where(state.going, low, state.low),
             jnp.where(state.going, high, state.high),
@@ -159,10 +167,8 @@ def _search(
         )
 
     zero = jnp.zeros(shape, size.dtype)
-    _, gap, _, _ = look(zero, 0.0)
-    level = jnp.minimum(gap, 0.0)
-    start = _Search(zero, zero, zero + jnp.inf, wanted & (zero == 0), zero > 0, jnp.asarray(0))
-    last = lax.while_loop(lambda s: s.going.any() & (s.count < ADVANCES), lambda s: advance(s, level), start)
+    start = _Search(zero, zero, zero, zero + jnp.inf, wanted & (zero == 0), zero > 0, jnp.asarray(0))
+    last = lax.while_loop(lambda s: s.going.any() & (s.count < ADVANCES), advance, start)
     # What is not decided by then is stopped where nothing was overstepped yet, and looked at again from there.
     return jnp.where(last.going, last.low, last.time), last.touches | last.going
 
@@ -189,25 +195,20 @@ def _with_derivative(model: Model, flight: Flight, end: Array, time: Array, happ
 
     `meets` is the time of the pair of each slot.
     """
-    fixed_model, fixed = lax.stop_gradient((model, flight))
 
-    def gaps(model: Model, flight: Flight, time: Array) -> tuple[Array, Array]:
+    def gaps(time: Array) -> tuple[Array, Array]:
         placed, _ = flight.at(time[None])
         found = find_contacts(model.scene, model.shapes, placed.position, placed.orientation)
         return found.separation, found.active
 
-    def rates(time: Array) -> tuple[Array, Array, Array]:
-        (gap, active), (rate, _) = jax.jvp(lambda t: gaps(fixed_model, fixed, t), (time,), (jnp.ones_like(time),))
-        return gap, rate, active
-
-    gap, rate, active = rates(time)
+    (gap, active), (rate, _) = jax.jvp(gaps, (time,), (jnp.ones_like(time),))
+    rate = lax.stop_gradient(rate)
     # The point that meets: the deepest of those of the pairs that meet now and approach.
     candidate = active & (meets <= time) & (rate < 0)
-    depth = jnp.where(candidate, gap, jnp.inf)
+    depth = jnp.where(candidate, lax.stop_gradient(gap), jnp.inf)
     first = jnp.argmin(depth, 0)[None] == jnp.arange(depth.shape[0])[:, None]
     chosen = settle(jnp.where(candidate & first, 1.0, 0.0))
-    rate = lax.stop_gradient((chosen * rate).sum(0))
-    step = -safe_divide((chosen * gaps(model, flight, time)[0]).sum(0), rate)
+    step = -safe_divide((chosen * gap).sum(0), (chosen * rate).sum(0))
     least = jnp.finfo(time.dtype).eps * end
     refined = jnp.clip(time + lax.stop_gradient(step), least, end)
     return jnp.where(happens, refined + step - lax.stop_gradient(step), end)
