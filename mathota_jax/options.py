@@ -58,6 +58,16 @@ class Options:
         handled in the next step. Off: absent; contacts found at the start of a step are then extrapolated over it, which
         is exact for bodies that hit what they head for, but lets fast turning ones slip through and stops others at what
         they would have passed. Guide 10.4.
+      impact_events: impacts of one step at which it is split, 0 for none; absent where nothing bounces. The forces of the
+        step act before and after each, all bodies are taken where they are at the time of the impact, and those that
+        touch there collide in rounds, which passes the whole velocity through a cradle. What comes after the last event is
+        an ordinary step, in which a pair can bounce once. Off, the first bounce of a step is exact too, in value and
+        derivative, for a ball on a plane: its time is found in closed form, with the contact normal of the start of
+        the step. Set it where bodies bounce off each other, off edges and corners or more often than once a step, or where
+        their momenta, energy or derivatives must be exact: then they are, to round-off and at any time step. Followed are the
+        pairs that have contact slots of their own: up to 300 with "auto". Not with "soft_step", `continuous` or `sleep`. A
+        step without impact costs a look at its contacts more, one with k impacts k + 1 steps and k searches; a batch takes
+        as many parts as the world with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
       sleep: let islands of bodies at rest sleep until something disturbs them; off: absent. Guide 3.4 and 12.2. A body
         asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing.
       sleep_velocity: speed below which a body may be at rest [m/s]. Guide 11.3. It belongs to things about a metre long

@@ -231,9 +231,10 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     problem = constrain(model, state, bodies, blocks, inertia, free, _gravity(model), action)
     packed = contact.pack_motion(scene, *free)
     now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
-    meets, bounces = collisions.foreseen(whole, problem, now, packed, _gravity(model), left)
+    foreseen, bounces = collisions.foreseen(whole, problem, now, packed, _gravity(model), left)
     split = bounces & ~last & ~progress.ended
-    dropped = tuple(group & split for group in meets)
+    # Rows would hold together what has just rebounded and is still near.
+    dropped = tuple((apart & split) | clear for apart, clear in foreseen)
     contact_rows = [
         group._replace(rows=collisions.without(group.rows, none))
         for group, none in zip(problem.contact_rows, dropped, strict=True)

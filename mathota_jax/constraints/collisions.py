@@ -50,8 +50,8 @@ def pair_restitution(model: Model) -> Array:
 
 def foreseen(
     model: Model, problem: Problem, now: Array, then: Array, gravity: Vec3, left: Array
-) -> tuple[tuple[Array, ...], Array]:
-    """The contacts that will meet at speed within the time `left` if nothing stops them.
+) -> tuple[tuple[tuple[Array, Array], ...], Array]:
+    """The contacts that will meet at speed within the time `left` if nothing stops them, and those that will not.
 
     Args:
       model: parameters, `dt` being the whole time step, and static scene.
@@ -61,7 +61,8 @@ def foreseen(
       left: (world,) time [s].
 
     Returns:
-      For each group of contact rows (turn, 1, column, world) whether it will, and (world,) whether any that bounces does.
+      For each group of contact rows, (turn, 1, column, world): what a step that is split leaves to the search, since it
+      meets at speed or is apart; what parts at speed and does not meet again. (world,) whether any that bounces meets.
     """
     found, worlds = [], now.shape[-1]
     bounces = jnp.zeros(worlds, bool)
@@ -71,7 +72,8 @@ def foreseen(
     for group in groups:
         rows = group.rows
         if isinstance(rows.table, TracedTable):
-            found.append(jnp.zeros((*rows.bias.shape[:1], 1, *rows.bias.shape[2:]), bool))
+            none = jnp.zeros((*rows.bias.shape[:1], 1, *rows.bias.shape[2:]), bool)
+            found.append((none, none))
             continue
 
         def along(velocity: Array, jacobian: Sequence[Array], rows: Rows = rows) -> Array:
@@ -88,9 +90,14 @@ def foreseen(
         down = jnp.where(divisor > 0, 2.0 * gap / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
         time = jnp.where(start > 0, up, down)
         rests = rest_speed(pull, dt, group.size, scale)
-        meets = (discriminant >= 0) & (time <= left) & (jnp.where(e > 0, e, 1.0) * speed > rests) & _acts(rows)
-        meets = settle(jnp.where(meets, 1.0, 0.0)) > 0.5
-        found.append(meets)
+        fast = (jnp.where(e > 0, e, 1.0) * speed > rests) & _acts(rows)
+        reaches = (discriminant >= 0) & (time <= left)
+        # The search follows what is apart; its rows, which extrapolate along one normal, could only disturb it.
+        followed = ~reaches & (group.separation > TOUCHING * group.size)
+        meets = settle(jnp.where(fast & reaches, 1.0, 0.0)) > 0.5
+        followed = settle(jnp.where(followed, 1.0, 0.0)) > 0.5
+        clear = settle(jnp.where(fast & (start > 0) & (time > left), 1.0, 0.0)) > 0.5
+        found.append((meets | followed, clear))
         bounces = bounces | (meets & (e > 0)).any((0, 1, 2))
     return tuple(found), bounces
 
@@ -171,7 +178,8 @@ def _rounds(
         for group, e in zip(groups, bounce, strict=True):
             speed = pgs.first_row_velocity(group.rows.table, group.rows.jacobian, None, velocity)
             rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), e * speed, 0.0)
-            chosen = without(group.rows, _approach(group.rows, velocity) <= least)
+            # What does not bounce at all just holds: a ball rebounds from a plate that lies on the ground.
+            chosen = without(group.rows, (_approach(group.rows, velocity) <= least) & (e > 0))
             zero = jnp.zeros_like(chosen.bias)
             rebounds.append(jnp.concatenate([rebound, zero[:, 1:]], axis=1))
             rows.append(dataclasses.replace(chosen, bias=zero))
