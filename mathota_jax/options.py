@@ -64,7 +64,7 @@ class Options:
         an ordinary step, in which a pair can bounce once. Off, the first bounce of a step is exact too, in value and
         derivative, for a ball on a plane: its time is found in closed form, with the contact normal of the start of
         the step. Set it where bodies bounce off each other, off edges and corners or more often than once a step, or where
-        their momenta, energy or derivatives must be exact: then they are, to round-off and at any time step. Followed are the
+        their momenta, energy or derivatives must be exact: then they are, to round-off, at any time step. Followed are the
         pairs that have contact slots of their own: up to 300 with "auto". Not with "soft_step", `continuous` or `sleep`. A
         step without impact costs a look at its contacts more, one with k impacts k + 1 steps and k searches; a batch takes
         as many parts as the world with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
