@@ -11,12 +11,9 @@ from tests.scenes import (
     DOWN,
     GRAVITY,
     advance,
-    advance_worlds,
     axis_angle,
     body_on_plane,
-    repeat,
     rotation_matrix,
-    stack,
     undamped,
     with_dt,
 )
@@ -74,13 +71,13 @@ def test_bounces_at_any_time_step(precision, box, gate):
 
 
 def test_more_bounces_than_events_lose_nothing(precision, gate):
-    """One event in a step of ten bounces: the ordinary step takes the rest, and nothing passes through the plane."""
+    """Up to nine bounces in a step of three events: the ordinary step takes the rest, and nothing passes the plane."""
     model, state = bouncing(None)
-    models = stack([with_dt(model, dt) for dt in (0.3, 0.7, 1.0, 2.0)])
-    final = advance_worlds(models, repeat(state, 4), 10)
-    low = np.asarray(final.position, dtype=float)[:, 1, 1] - 0.1
-    gate("below the plane [m]", np.minimum(low, 0.0), 1e-3)
-    gate("above the start [m]", np.maximum(low - DROP, 0.0), 0.0)
+    for dt in (0.3, 0.7, 1.0, 2.0):
+        final = advance(with_dt(model, dt), state, 10)
+        gap = float(final.position[1, 1]) - 0.1
+        gate(f"below the plane, dt {dt} [m]", min(gap, 0.0), 1e-3)
+        gate(f"above the start, dt {dt} [m]", max(gap - DROP, 0.0), 0.0)
 
 
 def test_oblique_collision_at_any_time_step(float64, gate):
