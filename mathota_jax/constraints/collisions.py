@@ -82,7 +82,8 @@ def foreseen(
         start, free = (along(velocity, rows.jacobian) for velocity in (now, then))
         scale = along(jnp.abs(now), [jnp.abs(side) for side in rows.jacobian])
         e = pack_scalars(rows.table, [select(rows.table, restitution)], worlds)
-        gap, acceleration = jnp.maximum(group.separation, 0.0), (free - start) / left
+        # One of two bodies that fall may be held: to foresee too much costs a search, too little a contact.
+        gap, acceleration = jnp.maximum(group.separation, 0.0), jnp.minimum((free - start) / left, -pull)
         discriminant = start * start - 2.0 * acceleration * gap
         speed = jnp.sqrt(jnp.maximum(discriminant, 0.0))
         falls, divisor = acceleration < 0, speed - start

@@ -61,7 +61,7 @@ def test_bounces_at_any_time_step(precision, box, gate):
         position, time = np.asarray(final.position, dtype=float), dt * count
         gap = position[1, 1] - 0.1 - (position[3, 1] + 0.1 if box == "below" else 0.0)
         # The box sinks by less than the slop, and the ball on it falls by as much further.
-        limit = 1e-3 if box == "below" else round_off
+        limit = 5e-5 if box == "below" else round_off
         gate(f"gap after {count} steps of {dt:.4f} s [m]", gap - height(time), limit)
         gate("free fall, relative", (50.0 - position[2, 1]) / (GRAVITY * time**2 / 2) - 1, 2e-5)
         if box:
