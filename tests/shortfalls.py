@@ -5,7 +5,6 @@ A test that starts to pass fails the suite (strict xfail), so that its entry is 
 
 from __future__ import annotations
 
-EVENTS = "contacts are taken at the start of the step, not at the time of impact, and one impact is resolved per step; "
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
@@ -20,11 +19,6 @@ SHORTFALLS: dict[str, str] = {
     "its centre ends up to 77 mm in the ground",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
-    "tests/physics/test_billiards.py::test_oblique_collision": EVENTS + "positions 6.6e-3 m off at dt 1/240, gate 1e-3",
-    "tests/physics/test_billiards.py::test_cradle_passes_the_whole_velocity_on": EVENTS
-    + "the last ball leaves with 0.71 of the velocity, gate 0.999",
-    "tests/physics/test_momentum.py::test_collisions_keep_the_invariants": EVENTS
-    + "angular momentum 0.013 to 0.025 kg m^2/s off, gate 1e-9",
     "tests/physics/test_joints.py::test_hinge_limits_hold[float32-1.0]": SWEEPS
     + "joint gap 5.6e-3 of the arm, gate 5e-3",
     "tests/physics/test_joints.py::test_hinge_limits_hold[float64-1.0]": SWEEPS

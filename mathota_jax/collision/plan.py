@@ -53,8 +53,8 @@ def plan_broadphase(
     moving = sum(not static[entries[k].body] for k in shapes)
     fixed = len(shapes) - moving
     pair_count = moving * (moving - 1) // 2 + moving * fixed
-    # The search along the motion needs pairs that have slots of their own.
-    own_up_to = ONE_BY_ONE_UP_TO if options.continuous else OWN_SLOTS_UP_TO
+    # A search along the motion needs pairs that have slots of their own.
+    own_up_to = ONE_BY_ONE_UP_TO if options.continuous or options.impact_events else OWN_SLOTS_UP_TO
     few = options.broadphase == "auto" and pair_count <= own_up_to
     if options.broadphase == "none" or few or pair_count == 0:
         return None

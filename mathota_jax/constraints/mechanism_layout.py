@@ -82,7 +82,9 @@ class Layout:
 @functools.cache
 def layout(scene: Scene) -> Layout | None:
     """The mechanisms of a scene; None where there is none, or where joints are left to the solver."""
-    if scene.options.solver == "soft_step" or not scene.options.exact_joints:
+    options = scene.options
+    # Between impacts bodies follow paths of constant force, which a closing of the joints would leave.
+    if options.solver == "soft_step" or options.impact_events or not options.exact_joints:
         return None
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
     held = {

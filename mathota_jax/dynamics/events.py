@@ -17,9 +17,8 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies
-from mathota_jax.collision.narrowphase import SPECULATIVE, group_contacts
-from mathota_jax.collision.placement import shape_parameters
-from mathota_jax.geometry.bounds import bounding_radius
+from mathota_jax.collision.narrowphase import SPECULATIVE
+from mathota_jax.dynamics.pair_motion import contacts_between, reaches, smaller_moving, turning
 from mathota_jax.model import Model
 from mathota_jax.scene import PairGroup
 from mathota_jax.spatial.indexing import take, unstack
@@ -124,35 +123,18 @@ def _shares(model: Model, motion: Motion, full: Array) -> Array:
 
 
 def _pairs(model: Model, group: PairGroup, motion: Motion) -> _Pairs:
-    scene = model.scene
     sides = (group.bodies_a, group.bodies_b)
-    sizes = [take(model.size, side) for side in sides]
-    moving = [
-        jnp.where(np.asarray([scene.static[body] for body in side])[:, None], jnp.inf, size)
-        for side, size in zip(sides, sizes, strict=True)
-    ]
-    reach = []
-    for kind, rows in ((group.kind_a, group.shapes_a), (group.kind_b, group.shapes_b)):
-        radius = bounding_radius(kind, shape_parameters(scene, model.shapes, kind, rows))
-        local = model.shapes[kind].get("local_position")
-        offset = 0.0 if local is None else norm(Vec3(*unstack(take(local, rows), 1)))
-        # A sphere about its centre of mass turns in itself.
-        reach.append(offset if kind == "sphere" else radius + offset)
     a, b = (take(motion, side) for side in sides)
-    return _Pairs(a, b, tuple(reach), jnp.minimum(*moving), jnp.minimum(*sizes))  # type: ignore[arg-type]
+    sizes = [take(model.size, side) for side in sides]
+    return _Pairs(a, b, reaches(model, group), smaller_moving(model, group), jnp.minimum(*sizes))
 
 
 def _fast(pairs: _Pairs) -> Array:
     """(pair, world) whether the step moves two bodies so far that contacts at its start do not see what they meet."""
     travel = norm(pairs.a.shift - pairs.b.shift) + sum(
-        _product(norm(body.turn), reach) for body, reach in zip((pairs.a, pairs.b), pairs.reach, strict=True)
+        turning(norm(body.turn), reach) for body, reach in zip((pairs.a, pairs.b), pairs.reach, strict=True)
     )
     return travel > SPECULATIVE * pairs.moving_size
-
-
-def _product(turn: Array, reach: Array) -> Array:
-    """Infinite shapes do not turn."""
-    return jnp.where(turn > 0, turn * reach, 0.0)
 
 
 def _closest(model: Model, group: PairGroup, pairs: _Pairs, share_a: Array, share_b: Array) -> tuple[Array, Vec3]:
@@ -160,14 +142,7 @@ def _closest(model: Model, group: PairGroup, pairs: _Pairs, share_a: Array, shar
     count = len(group.bodies_a)
     placed = pairs.a.at(share_a), pairs.b.at(share_b)
     worlds = max(component.shape[-1] for place in placed for part in place for component in part)
-
-    def join(first: Array, second: Array) -> Array:
-        return jnp.concatenate([jnp.broadcast_to(x, (count, worlds)) for x in (first, second)])
-
-    position = Vec3(*map(join, placed[0][0], placed[1][0]))
-    orientation = Quaternion(*map(join, placed[0][1], placed[1][1]))
-    apart = group._replace(bodies_a=tuple(range(count)), bodies_b=tuple(range(count, 2 * count)))
-    found = group_contacts(model.scene, apart, model.shapes, position, orientation)
+    found = contacts_between(model, group, *placed)
 
     def by_point(values: Array) -> list[Array]:
         return unstack(jnp.broadcast_to(values, (*values.shape[:-1], worlds)).reshape(count, -1, worlds), 1)
@@ -200,8 +175,8 @@ def _first_touch(model: Model, group: PairGroup, pairs: _Pairs, share: Array) ->
             own = dot(normal, body.shift) * sign
             # Standing later is no faster than either.
             own = jnp.where(end < 1, jnp.where(time < end, jnp.maximum(own, 0.0), 0.0), own)
-            turning = _product(norm(cross(normal, body.turn)), reach)
-            total = total + own + jnp.where(time < end, turning, 0.0)
+            around = turning(norm(cross(normal, body.turn)), reach)
+            total = total + own + jnp.where(time < end, around, 0.0)
         return total
 
     def advance(state: tuple) -> tuple:

@@ -24,7 +24,7 @@ def colliding_worlds(shapes, seed):
         angle = 2 * np.pi * index / len(shapes)
         place = 0.9 * np.array([np.cos(angle), np.sin(angle), 0.0])
         builder.add_body(shape, mass=1.0 + index, position=place, velocity=-2.0 * place, restitution=1.0, friction=0.5)
-    model, state = builder.build(undamped(dt=1 / 240))
+    model, state = builder.build(undamped(dt=1 / 240, impact_events=3))
     rng = np.random.default_rng(seed)
     models, states = repeat(model, WORLDS), repeat(state, WORLDS)
     turn = rng.normal(size=states.orientation.shape)
@@ -39,7 +39,10 @@ def colliding_worlds(shapes, seed):
     return model, models, states
 
 
-@pytest.mark.parametrize("name", SCENES)
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SCENES if name != "spheres"]  # compiles for minutes
+
+
+@pytest.mark.parametrize("name", ["spheres", *SLOW])
 def test_collisions_keep_the_invariants(precision, name, gate):
     model, models, states = colliding_worlds(SCENES[name], seed=1)
     _, record = record_worlds(models, states, 240, motion)

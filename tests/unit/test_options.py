@@ -21,6 +21,7 @@ DEFAULTS = {
     "solver": "pgs",
     "exact_joints": True,
     "substeps": None,
+    "impact_events": 0,
 }
 OFF = {"position_iterations": 0, "linear_damping": 0.0, "angular_damping": 0.0, "slop": 0.0, "position_percent": 0.0}
 
@@ -55,6 +56,11 @@ def test_bad_broadphase_is_refused(name, value):
         ({"solver": "newton"}, r"Options\.solver must be one of 'pgs', 'converged', 'soft_step', got 'newton'"),
         ({"solver": "soft_step", "substeps": 0}, r"Options\.substeps must be an integer of at least 1, got 0"),
         ({"solver": "soft_step", "substeps": 2.5}, r"Options\.substeps must be an integer of at least 1, got 2.5"),
+        ({"impact_events": -1}, r"Options\.impact_events must be an integer of at least 0, got -1"),
+        ({"impact_events": True}, r"Options\.impact_events must be an integer of at least 0, got True"),
+        ({"impact_events": 1, "solver": "soft_step"}, r"Options\.impact_events needs solver='pgs' or 'converged'"),
+        ({"impact_events": 1, "sleep": True}, r"Options\.impact_events = 1 can not be combined with .*sleep=True"),
+        ({"impact_events": 1, "continuous": True}, r"Options\.impact_events = 1 .* continuous=True.*switch these off"),
         ({"substeps": 4}, r"Options\.substeps = 4 needs solver='soft_step', got solver='pgs'; .* divide dt"),
         ({"solver": "converged", "substeps": 2}, r"Options\.substeps = 2 needs solver='soft_step'"),
     ],

@@ -1,0 +1,298 @@
+"""Collisions: which contacts will meet at speed within a step, and what happens when they do.
+
+Bodies that meet exchange impulses in rounds: in each, the contacts that approach, and only those, are solved together
+with Newton's restitution and Coulomb's friction; those that approach after it have the next round. So the points of a
+face that lands are symmetric, and a cradle passes its velocity on from ball to ball. Every round keeps the momenta, and
+elastic ones without friction the energy (B. Smith, D. Kaufman, E. Vouga, R. Tamstorf, E. Grinspun, "Reflections on
+Simultaneous Impact", ACM Trans. Graph. 31(4), 2012: generalized reflections).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from mathota_jax.bodies import Bodies, Inertia, moving_inertia, unpack_blocks
+from mathota_jax.collision.narrowphase import ContactSet, find_contacts
+from mathota_jax.collision.rest import TOUCHING, rest_speed
+from mathota_jax.constraints import contact, joint
+from mathota_jax.constraints.assembly import collect, pack_scalars, select
+from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
+from mathota_jax.constraints.joint_rows import JointRows, joint_rows
+from mathota_jax.constraints.joints.rows import STOP
+from mathota_jax.constraints.problem import Problem
+from mathota_jax.model import Model
+from mathota_jax.solver import pgs
+from mathota_jax.solver.laws import Cone
+from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.table import TracedTable
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.vector import Vec3, cross, dot, norm
+
+ROUNDS = 16
+"""Largest number of rounds; what still approaches then is stopped by the contacts of the next step."""
+
+Impulses = tuple[Array, ...]
+
+
+def pair_restitution(model: Model) -> Array:
+    """(slot, world) of the slots that belong to a pair: the smaller of the two coefficients (guide 8.2)."""
+    smaller = jnp.minimum(*(take(model.restitution, np.asarray(side)) for side in model.scene.slot_bodies))
+    return jnp.broadcast_to(smaller, (model.scene.static_slot_count, smaller.shape[-1]))
+
+
+def foreseen(
+    model: Model, problem: Problem, now: Array, then: Array, gravity: Vec3, left: Array
+) -> tuple[tuple[tuple[Array, Array], ...], Array]:
+    """The contacts that will meet at speed within the time `left` if nothing stops them, and those that will not.
+
+    Args:
+      model: parameters, `dt` being the whole time step, and static scene.
+      problem: of the time that is left.
+      now, then: (component, block, world) velocities now and after that time without constraints.
+      gravity: components (1, world).
+      left: (world,) time [s].
+
+    Returns:
+      For each group of contact rows, (turn, 1, column, world): what a step that is split leaves to the search, since it
+      meets at speed or is apart; what parts at speed and does not meet again. (world,) whether any that bounces meets.
+    """
+    found, worlds = [], now.shape[-1]
+    bounces = jnp.zeros(worlds, bool)
+    pull, left = norm(gravity), left[None]
+    fixed = lax.stop_gradient((problem.contact_rows, now, then, pull, left, model.dt, pair_restitution(model)))
+    groups, now, then, pull, left, dt, restitution = fixed
+    for group in groups:
+        rows = group.rows
+        if isinstance(rows.table, TracedTable):
+            none = jnp.zeros((*rows.bias.shape[:1], 1, *rows.bias.shape[2:]), bool)
+            found.append((none, none))
+            continue
+
+        def along(velocity: Array, jacobian: Sequence[Array], rows: Rows = rows) -> Array:
+            return pgs.first_row_velocity(rows.table, jacobian, rows.places, velocity)
+
+        start, free = (along(velocity, rows.jacobian) for velocity in (now, then))
+        scale = along(jnp.abs(now), [jnp.abs(side) for side in rows.jacobian])
+        e = pack_scalars(rows.table, [select(rows.table, restitution)], worlds)
+        # One of two bodies that fall may be held: to foresee too much costs a search, too little a contact.
+        gap, acceleration = jnp.maximum(group.separation, 0.0), jnp.minimum((free - start) / left, -pull)
+        discriminant = start * start - 2.0 * acceleration * gap
+        speed = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+        falls, divisor = acceleration < 0, speed - start
+        up = jnp.where(falls, (start + speed) / jnp.where(falls, -acceleration, 1.0), jnp.inf)
+        down = jnp.where(divisor > 0, 2.0 * gap / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
+        time = jnp.where(start > 0, up, down)
+        rests = rest_speed(pull, dt, group.size, scale)
+        fast = (jnp.where(e > 0, e, 1.0) * speed > rests) & _acts(rows)
+        reaches = (discriminant >= 0) & (time <= left)
+        # The search follows what is apart; its rows, which extrapolate along one normal, could only disturb it.
+        followed = ~reaches & (group.separation > TOUCHING * group.size)
+        meets = settle(jnp.where(fast & reaches, 1.0, 0.0)) > 0.5
+        followed = settle(jnp.where(followed, 1.0, 0.0)) > 0.5
+        clear = settle(jnp.where(fast & (start > 0) & (time > left), 1.0, 0.0)) > 0.5
+        found.append((meets | followed, clear))
+        bounces = bounces | (meets & (e > 0)).any((0, 1, 2))
+    return tuple(found), bounces
+
+
+def _acts(rows: Rows) -> Array:
+    """(turn, 1, column, world) whether a contact exists."""
+    law = rows.law
+    return (law.normal_mass[:, None] if isinstance(law, Cone) else law.effective_mass) > 0
+
+
+def without(rows: Rows, dropped: Array) -> Rows:
+    """The rows of contacts without those `dropped` (turn, 1, column, world)."""
+    law = rows.law
+    if isinstance(law, Cone):
+        keep = jnp.where(dropped, 0.0, 1.0)[:, 0]
+        law = dataclasses.replace(law, normal_mass=law.normal_mass * keep, tangent_mass=law.tangent_mass * keep)
+    else:
+        law = dataclasses.replace(law, effective_mass=law.effective_mass * jnp.where(dropped, 0.0, 1.0))
+    return dataclasses.replace(rows, law=law)
+
+
+def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity: Vec3) -> tuple[Bodies, list[Array]]:
+    """What approaches where it touches collides.
+
+    Args:
+      model: parameters, `dt` being the whole time step, and static scene.
+      bodies, blocks: all bodies and the moving ones, where they meet, with their velocities before.
+      chosen: (world,) worlds in which there is a collision.
+      gravity: components (1, world).
+
+    Returns:
+      The moving bodies with their velocities after it, and the impulses as mean forces over the whole step: those on the
+      contact slots (slot, 3, world), then those of the joint rows (slot, world) if there are joints.
+    """
+    scene = model.scene
+    pull = norm(gravity)
+    contacts = find_contacts(scene, model.shapes, bodies.position, bodies.orientation)
+    active = contacts.active & chosen & _touch(model, bodies, contacts, pull)
+    contacts = compute_once(contacts._replace(active=active), bodies.position.x)
+    inertia = moving_inertia(scene, model, blocks.orientation)
+    velocity, held, groups, impulses = _rounds(model, bodies, blocks, inertia, contacts, gravity)
+    linear, angular = unpack_blocks(velocity)
+    moved = blocks._replace(velocity=linear)
+    if angular is not None:
+        moved = moved._replace(angular_velocity=angular)
+    forces = [contact.slot_force(groups, list(impulses[len(held) :]), scene.slot_count, model.dt)]
+    if held:
+        values = [impulse[:, 0] / model.dt for impulse in impulses[: len(held)]]
+        forces.append(collect([rows.table for rows in held], values, joint_row_count(scene)))
+    return moved, forces
+
+
+def _rounds(
+    model: Model, bodies: Bodies, blocks: Bodies, inertia: Inertia, contacts: ContactSet, gravity: Vec3
+) -> tuple[Array, tuple[Rows, ...], list[ContactRows], Impulses]:
+    """Velocities (component, block, world) after all rounds, rows of joints and contacts, and the sum of the impulses."""
+    scene = model.scene
+    pull = norm(gravity)
+    before = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
+    inverse = compute_once(inertia.inverse(), before)
+    motion = contact.Motion(blocks.position, before, before, inverse, gravity)
+    groups = [contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)]
+    held = _held(model, joint_rows(model, bodies), inertia, before) if joint_row_count(scene) else ()
+    fast = [_approach(group.rows, before) for group in groups]
+    worlds = before.shape[-1]
+    fastest = jnp.zeros((1, worlds), before.dtype)
+    for speed in fast:
+        fastest = jnp.maximum(fastest, speed.max((0, 1, 2)))
+    # What the solver leaves of the first approach is no second one.
+    least = lax.stop_gradient(float(jnp.finfo(before.dtype).eps) ** 0.5 * fastest)
+    restitution = pair_restitution(model)
+    bounce = [pack_scalars(group.rows.table, [select(group.rows.table, restitution)], worlds) for group in groups]
+    iterations = 4 * scene.options.velocity_iterations
+
+    def solve(state: tuple[Array, Impulses]) -> tuple[Array, Impulses]:
+        velocity, total = state
+        rows, rebounds = list(held), [jnp.zeros_like(row.bias) for row in held]
+        for group, e in zip(groups, bounce, strict=True):
+            speed = pgs.first_row_velocity(group.rows.table, group.rows.jacobian, None, velocity)
+            rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), e * speed, 0.0)
+            # What does not bounce at all just holds: a ball rebounds from a plate that lies on the ground.
+            chosen = without(group.rows, (_approach(group.rows, velocity) <= least) & (e > 0))
+            zero = jnp.zeros_like(chosen.bias)
+            rebounds.append(jnp.concatenate([rebound, zero[:, 1:]], axis=1))
+            rows.append(dataclasses.replace(chosen, bias=zero))
+        start = tuple(jnp.zeros_like(part) for part in total)
+        gradient = scene.options.gradient_iterations or 2 * iterations
+
+        def with_restitution(share: Array | float) -> Impulses:
+            biased = tuple(
+                dataclasses.replace(row, bias=row.bias + share * rebound)
+                for row, rebound in zip(rows, rebounds, strict=True)
+            )
+            return pgs.solve(iterations, gradient, biased, velocity, start)[1]
+
+        if scene.friction:
+            both = lax.map(with_restitution, jnp.array([0.0, 1.0], velocity.dtype))
+            stopping, full = (tuple(part[k] for part in both) for k in range(2))
+            impulses = _without_gain(tuple(rows), velocity, stopping, full)
+        else:
+            impulses = with_restitution(1.0)
+        velocity = pgs.add_impulses(tuple(rows), velocity, impulses)
+        return velocity, tuple(a + b for a, b in zip(total, impulses, strict=True))
+
+    def approaches(velocity: Array) -> Array:
+        going = jnp.asarray(False)
+        for group in groups:
+            going = going | (_approach(group.rows, lax.stop_gradient(velocity)) > least).any()
+        return going
+
+    def one_round(state: tuple[Array, Impulses], _: None) -> tuple[tuple[Array, Impulses], None]:
+        return lax.cond(approaches(state[0]), solve, lambda state: state, state), None
+
+    everything = (*held, *(group.rows for group in groups))
+    start = tuple(jnp.zeros((*rows.bias.shape[:-1], worlds), before.dtype) for rows in everything)
+    (velocity, impulses), _ = lax.scan(one_round, (before, start), None, length=ROUNDS)
+    return velocity, held, groups, impulses
+
+
+def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, full: Impulses) -> Impulses:
+    """As much of the restitution as gains no energy.
+
+    With friction Newton's restitution can (T. R. Kane, D. A. Levinson, "Dynamics: Theory and Applications", 1985); an
+    impact without it never does, and between the two sets of impulses the energy is a parabola.
+    """
+    difference = tuple(b - a for a, b in zip(stopping, full, strict=True))
+    stopped = pgs.add_impulses(rows, velocity, stopping)
+    at_end = pgs.add_impulses(rows, velocity, full)
+    zero = jnp.zeros(velocity.shape[-1], velocity.dtype)
+    lost, slope, bend = zero, zero, zero
+    for group, first, more in zip(rows, stopping, difference, strict=True):
+        before, middle, after = (pgs.row_velocity(group, v) for v in (velocity, stopped, at_end))
+        lost = lost - 0.5 * (first * (before + middle)).sum((0, 1, 2))
+        slope = slope + (more * middle).sum((0, 1, 2))
+        bend = bend + (more * (after - middle)).sum((0, 1, 2))
+    gains = settle(jnp.where(slope + 0.5 * bend > lost, 1.0, 0.0)) > 0.5
+    lost = jnp.maximum(lost, 0.0)
+    root = safe_sqrt(jnp.where(gains, jnp.maximum(slope * slope + 2.0 * bend * lost, 0.0), 1.0))
+    share = jnp.where(gains, jnp.clip(safe_divide(2.0 * lost, slope + root), 0.0, 1.0), 1.0)
+    return tuple(first + share * more for first, more in zip(stopping, difference, strict=True))
+
+
+def _approach(rows: Rows, velocity: Array) -> Array:
+    """(turn, 1, column, world) speed at which each contact approaches; 0 where there is none."""
+    speed = -pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
+    return jnp.where(_acts(rows), jnp.maximum(speed, 0.0), 0.0)
+
+
+def _leaves(model: Model, group: ContactRows, pull: Array, e: Array, speed: Array, velocity: Array) -> Array:
+    """Whether the bodies of a contact leave each other after the impact, or rest."""
+    rows = group.rows
+    sides = [jnp.abs(side) for side in rows.jacobian]
+    scale = pgs.first_row_velocity(rows.table, sides, rows.places, jnp.abs(velocity))
+    rests = rest_speed(pull, model.dt, group.size, scale)
+    return settle(jnp.where(-e * speed > rests, 1.0, 0.0)) > 0.5
+
+
+def _touch(model: Model, bodies: Bodies, contacts: ContactSet, pull: Array) -> Array:
+    """(slot, world) whether the contact passes on an impulse: it meets now, or it touches and rests.
+
+    One that is about to meet, a moment later, has its own impact.
+    """
+    scene = model.scene
+    sides = scene.slot_bodies
+    velocities = []
+    for side in sides:
+        body: Bodies = take(bodies, np.asarray(side))
+        moves = 1.0 - np.asarray([float(scene.static[b]) for b in side])[:, None]
+        turned = cross(body.angular_velocity, contacts.position - body.position)
+        velocities.append((body.velocity + turned) * moves.astype(contacts.separation.dtype))
+    speed = jnp.abs(dot(contacts.normal, velocities[1] - velocities[0]))
+    scale = norm(velocities[0]) + norm(velocities[1])
+    sizes = [
+        jnp.where(np.asarray(scene.static)[np.asarray(side)][:, None], jnp.inf, take(model.size, np.asarray(side)))
+        for side in sides
+    ]
+    size = jnp.minimum(*sizes)
+    rests = speed <= rest_speed(pull, model.dt, size, scale)
+    gap = contacts.separation
+    meets = gap <= 4.0 * float(jnp.finfo(gap.dtype).eps) ** 0.5 * size
+    return settle(jnp.where(meets | (rests & (gap <= TOUCHING * size)), 1.0, 0.0)) > 0.5
+
+
+def _held(model: Model, joints: JointRows, inertia: Inertia, velocity: Array) -> tuple[Rows, ...]:
+    """Rows of the joints during a collision: they keep their rates; a stop that is reached lets none pass."""
+    scene = model.scene
+    stops = (joints.laws == STOP)[:, None]
+    room = jnp.where(stops, jnp.maximum(joints.error, 0.0) / model.dt, 0.0)
+    found = []
+    for table in joint_tables(scene):
+        rows = joint.position_rows(scene, table, joints, room, inertia)
+        one_sided = select(table, jnp.broadcast_to(jnp.asarray(stops), joints.error.shape))
+        worlds = rows.bias.shape[-1]
+        one_sided = pack_scalars(table, [one_sided.astype(velocity.dtype)], worlds) > 0.5
+        rate = pgs.row_velocity(rows, velocity)
+        found.append(dataclasses.replace(rows, bias=jnp.where(one_sided, rows.bias, -rate)))
+    return tuple(found)

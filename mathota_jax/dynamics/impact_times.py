@@ -1,0 +1,214 @@
+"""When the first bodies meet on their flight, and the derivative of that time.
+
+Every pair is followed from where it is by steps that stop short of the next touch: along the normal of a contact point
+the gap changes by its present rate and the relative acceleration, less at most what the turning of the bodies adds,
+``(omega^2 reach) t^2 / 2``. So a ball reaches a plane in one step, and the rest converges like Newton's method; what was
+overstepped all the same is found by going back. The search itself has no derivative. That of its result is the one of the
+root of the gap, ``d t = -d gap / (d gap / d t)``: with it, the motion before and after the impact has the derivative that
+is known as saltation matrix.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.collision.narrowphase import find_contacts
+from mathota_jax.collision.rest import TOUCHING, rest_speed
+from mathota_jax.dynamics.flight import Flight
+from mathota_jax.dynamics.pair_motion import contacts_between, reaches, smaller_moving, turning
+from mathota_jax.model import Model
+from mathota_jax.scene import PairGroup
+from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.vector import Vec3, cross, dot, norm
+
+ADVANCES = 64
+"""Largest number of steps of the search."""
+
+MARGIN = 256
+"""Multiples of the machine epsilon, of the time that is left, before its end from which an impact waits for the next step:
+something must be left to divide by."""
+
+
+class FirstImpact(NamedTuple):
+    """The first impact in each world.
+
+    Attributes:
+      time: (world,) [s]; the end of the time searched where there is none.
+      happens: (world,) bool.
+    """
+
+    time: Array
+    happens: Array
+
+
+class _Search(NamedTuple):
+    """State of the search for one group, (pair, world): no touch before `low`, one before `high`.
+
+    `level` is the gap that counts as touching: 0, or that of bodies that overlap from the start.
+    """
+
+    level: Array
+    time: Array
+    low: Array
+    high: Array
+    going: Array
+    touches: Array
+    count: Array
+
+
+def tolerance(dtype: jnp.dtype) -> float:
+    """Gap at which the search ends, as a share of the inner radius; one step of Newton's method takes it to round-off."""
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def first_impact(model: Model, flight: Flight, gravity: Vec3, left: Array, wanted: Array) -> FirstImpact:
+    """Time of the first impact within the time `left` (world,), in the worlds `wanted`.
+
+    Args:
+      model: parameters, `dt` being the whole time step, and static scene.
+      flight: of all bodies.
+      gravity: components (1, world).
+      left: time that is searched.
+      wanted: (world,) bool; the others have no impact.
+
+    Returns:
+      The impact; its time is differentiable in the flight and the shapes.
+    """
+    fixed_model, fixed, end, fixed_gravity = lax.stop_gradient((model, flight, left, gravity))
+    end = end * (1.0 - MARGIN * jnp.finfo(end.dtype).eps)
+    pull = norm(fixed_gravity)
+    best = jnp.broadcast_to(end, wanted.shape)
+    happens = jnp.zeros_like(wanted)
+    slots = []
+    for group in model.scene.pair_groups:
+        time, touches = _search(fixed_model, group, fixed, pull, end, wanted)
+        best = jnp.minimum(best, jnp.where(touches, time, jnp.inf).min(0))
+        happens = happens | touches.any(0)
+        slots.append(jnp.repeat(jnp.where(touches, time, jnp.inf), group.point_count, axis=0))
+    time = _with_derivative(model, flight, end, best, happens, jnp.concatenate(slots))
+    return FirstImpact(jnp.where(happens, time, left), happens)
+
+
+def _search(
+    model: Model, group: PairGroup, flight: Flight, gravity: Array, end: Array, wanted: Array
+) -> tuple[Array, Array]:
+    """Time (pair, world) at which each pair of a group first meets, and whether it does."""
+    count = len(group.bodies_a)
+    a, b = (take(flight, side) for side in (group.bodies_a, group.bodies_b))
+    reach_a, reach_b = reaches(model, group)
+    size = smaller_moving(model, group)
+    near = tolerance(size.dtype) * size
+    restitution = jnp.minimum(*(take(model.restitution, side) for side in (group.bodies_a, group.bodies_b)))
+    rebound = jnp.where(restitution > 0, restitution, 1.0)
+    acceleration = b.acceleration - a.acceleration
+    shape = (count, wanted.shape[-1])
+    end = jnp.broadcast_to(end, shape)
+
+    def look(time: Array, level: Array, first: Array) -> tuple[Array, Array, Array, Array, Array]:
+        """At a time: level; step to the next touch; gap and rate of the deepest point; whether there is an impact."""
+        (one, _), (other, _) = a.at(time), b.at(time)
+        found = contacts_between(model, group, one[:2], other[:2])
+        spin_a, spin_b = norm(one.angular_velocity), norm(other.angular_velocity)
+        swing = turning(spin_a, spin_a * reach_a) + turning(spin_b, spin_b * reach_b)
+        scale = norm(one.velocity) + norm(other.velocity) + turning(spin_a, reach_a) + turning(spin_b, reach_b)
+        rests = rest_speed(gravity, model.dt, size, scale)
+        step = jnp.full(shape, jnp.inf, size.dtype)
+        deepest, rate_there = step, jnp.zeros(shape, size.dtype)
+        impact = jnp.zeros(shape, bool)
+        columns = [
+            _by_point(component, count, shape) for component in (*found.position, *found.normal, found.separation)
+        ]
+        seen = []
+        for x, y, z, n_x, n_y, n_z, separation, active in zip(
+            *columns, _by_point(found.active, count, shape), strict=True
+        ):
+            point, normal = Vec3(x, y, z), Vec3(n_x, n_y, n_z)
+            velocity = other.velocity + cross(other.angular_velocity, point - other.position)
+            velocity = velocity - one.velocity - cross(one.angular_velocity, point - one.position)
+            rate = dot(normal, velocity)
+            rests_here = (separation <= TOUCHING * size) & (jnp.abs(rate) * rebound <= rests)
+            seen.append((active & ~rests_here, separation, rate, dot(normal, acceleration) - swing))
+        overlap = jnp.minimum(0.0, jnp.stack([jnp.where(counts, gap, 0.0) for counts, gap, *_ in seen]).min(0))
+        level = jnp.where(first, overlap, level)
+        for counts, separation, rate, bend in seen:
+            gap = separation - level
+            step = jnp.minimum(step, jnp.where(counts, _next_touch(gap, rate, bend, near), jnp.inf))
+            deeper = counts & (gap < deepest)
+            deepest, rate_there = jnp.where(deeper, gap, deepest), jnp.where(deeper, rate, rate_there)
+            impact = impact | (counts & (gap <= near) & (rate < 0))
+        return level, step, deepest, rate_there, impact
+
+    def advance(state: _Search) -> _Search:
+        level, step, gap, rate, impact = look(state.time, state.level, state.count == 0)
+        inside = settle(jnp.where((gap < -near) & (state.time > 0), 1.0, 0.0)) > 0.5
+        touches = settle(jnp.where(impact & ~inside, 1.0, 0.0)) > 0.5
+        low = jnp.where(inside, state.low, state.time)
+        high = jnp.where(inside, state.time, state.high)
+        back = state.time - jnp.where(rate < 0, gap / jnp.where(rate < 0, rate, 1.0), jnp.inf)
+        time = jnp.where(inside, back, state.time + step)
+        middle = 0.5 * (low + high)
+        time = jnp.where((time > low) & (time < high), time, jnp.where(jnp.isfinite(high), middle, time))
+        left = (time <= end) & (time > low)
+        going = state.going & ~touches & left
+        return _Search(
+            level,
+            jnp.where(going, time, state.time),
+            jnp.where(state.going, low, state.low),
+            jnp.where(state.going, high, state.high),
+            going,
+            state.touches | (state.going & touches),
+            state.count + 1,
+        )
+
+    zero = jnp.zeros(shape, size.dtype)
+    start = _Search(zero, zero, zero, zero + jnp.inf, wanted & (zero == 0), zero > 0, jnp.asarray(0))
+    last = lax.while_loop(lambda s: s.going.any() & (s.count < ADVANCES), advance, start)
+    # What is not decided by then is stopped where nothing was overstepped yet, and looked at again from there.
+    return jnp.where(last.going, last.low, last.time), last.touches | last.going
+
+
+def _next_touch(gap: Array, rate: Array, bend: Array, near: Array) -> Array:
+    """First time after now at which ``gap + rate t + bend t^2 / 2`` is 0, or is so again for a point that leaves now."""
+    gap = jnp.where((gap <= near) & (rate > 0), 0.0, jnp.maximum(gap, 0.0))
+    discriminant = rate * rate - 2.0 * bend * gap
+    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    divisor = root - rate
+    down = jnp.where(divisor > 0, 2.0 * gap / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
+    falls = bend < 0
+    up = jnp.where(falls, (rate + root) / jnp.where(falls, -bend, 1.0), jnp.inf)
+    return jnp.where(discriminant < 0, jnp.inf, jnp.where(rate > 0, up, down))
+
+
+def _by_point(values: Array, count: int, shape: tuple[int, int]) -> list[Array]:
+    """The (pair, world) values of each point of the manifolds, from (slot, world)."""
+    return unstack(jnp.broadcast_to(values, (values.shape[0], shape[1])).reshape(count, -1, shape[1]), 1)
+
+
+def _with_derivative(model: Model, flight: Flight, end: Array, time: Array, happens: Array, meets: Array) -> Array:
+    """The time where something happens, refined by one step of Newton's method, which carries the derivative.
+
+    `meets` is the time of the pair of each slot.
+    """
+
+    def gaps(time: Array) -> tuple[Array, Array]:
+        placed, _ = flight.at(time[None])
+        found = find_contacts(model.scene, model.shapes, placed.position, placed.orientation)
+        return found.separation, found.active
+
+    (gap, active), (rate, _) = jax.jvp(gaps, (time,), (jnp.ones_like(time),))
+    rate = lax.stop_gradient(rate)
+    # The point that meets: the deepest of those of the pairs that meet now and approach.
+    candidate = active & (meets <= time) & (rate < 0)
+    depth = jnp.where(candidate, lax.stop_gradient(gap), jnp.inf)
+    first = jnp.argmin(depth, 0)[None] == jnp.arange(depth.shape[0])[:, None]
+    chosen = settle(jnp.where(candidate & first, 1.0, 0.0))
+    step = -safe_divide((chosen * gap).sum(0), (chosen * rate).sum(0))
+    least = jnp.finfo(time.dtype).eps * end
+    refined = jnp.clip(time + lax.stop_gradient(step), least, end)
+    return jnp.where(happens, refined + step - lax.stop_gradient(step), end)

@@ -1,0 +1,57 @@
+"""Pairs of bodies each of which is somewhere on its way."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mathota_jax.collision.narrowphase import ContactSet, group_contacts
+from mathota_jax.collision.placement import shape_parameters
+from mathota_jax.geometry.bounds import bounding_radius
+from mathota_jax.model import Model
+from mathota_jax.scene import PairGroup
+from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.quaternion import Quaternion
+from mathota_jax.spatial.vector import Vec3, norm
+
+Placed = tuple[Vec3, Quaternion]
+
+
+def contacts_between(model: Model, group: PairGroup, a: Placed, b: Placed) -> ContactSet:
+    """Contacts of a group (slot, world) where its bodies A and B are placed as given, components (pair or 1, world)."""
+    count = len(group.bodies_a)
+    worlds = max(component.shape[-1] for place in (a, b) for part in place for component in part)
+
+    def join(first: Array, second: Array) -> Array:
+        return jnp.concatenate([jnp.broadcast_to(x, (count, worlds)) for x in (first, second)])
+
+    position, orientation = Vec3(*map(join, a[0], b[0])), Quaternion(*map(join, a[1], b[1]))
+    apart = group._replace(bodies_a=tuple(range(count)), bodies_b=tuple(range(count, 2 * count)))
+    return group_contacts(model.scene, apart, model.shapes, position, orientation)
+
+
+def reaches(model: Model, group: PairGroup) -> tuple[Array, Array]:
+    """(pair or 1, world) how far the shapes A and B reach from the centres of mass, as far as turning moves them."""
+    found = []
+    for kind, rows in ((group.kind_a, group.shapes_a), (group.kind_b, group.shapes_b)):
+        radius = bounding_radius(kind, shape_parameters(model.scene, model.shapes, kind, rows))
+        local = model.shapes[kind].get("local_position")
+        offset = jnp.zeros((1, 1), model.size.dtype) if local is None else norm(Vec3(*unstack(take(local, rows), 1)))
+        # A sphere about its centre of mass turns in itself.
+        found.append(offset if kind == "sphere" else radius + offset)
+    return found[0], found[1]
+
+
+def smaller_moving(model: Model, group: PairGroup) -> Array:
+    """(pair or 1, world) inner radius of the smaller moving body of each pair."""
+    sizes = [
+        jnp.where(np.asarray([model.scene.static[body] for body in side])[:, None], jnp.inf, take(model.size, side))
+        for side in (group.bodies_a, group.bodies_b)
+    ]
+    return jnp.minimum(*sizes)
+
+
+def turning(turn: Array, reach: Array) -> Array:
+    """Product with the reach; infinite shapes do not turn."""
+    return jnp.where(turn > 0, turn * reach, 0.0)

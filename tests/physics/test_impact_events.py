@@ -1,0 +1,159 @@
+"""Steps that split at impacts (`Options.impact_events`): exact for every time step, whatever else is in the scene."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import Box, Plane, SceneBuilder, Sphere
+from tests.scenes import (
+    DOWN,
+    GRAVITY,
+    advance,
+    axis_angle,
+    body_on_plane,
+    rotation_matrix,
+    undamped,
+    with_dt,
+)
+
+DROP, BOUNCE = 0.5, 0.8
+
+
+def bouncing(box):
+    """Bodies: plane, ball dropped by `DROP`, ball that never touches anything, box at rest on the plane.
+
+    `box` is where: None for no box, "beside" the ball, or "below" it, then on a plane from which nothing rebounds.
+    """
+    builder = SceneBuilder(gravity=DOWN)
+    below = box == "below"
+    builder.add_body(
+        Plane(normal=(0, 1, 0), offset=0.0), static=True, restitution=0.0 if below else BOUNCE, friction=0.0
+    )
+    surface = {"mass": 1.0, "restitution": BOUNCE, "friction": 0.0}
+    builder.add_body(Sphere(0.1), position=(0.0, (0.2 if below else 0.0) + 0.1 + DROP, 0.0), **surface)
+    builder.add_body(Sphere(0.1), position=(5.0, 50.0, 0.0), **surface)
+    if box:
+        builder.add_body(Box((0.1, 0.1, 0.1)), position=(0.0 if below else 1.0, 0.1, 0.0), **surface)
+    return builder.build(undamped(impact_events=3))
+
+
+def height(time):
+    """Gap [m] under a ball that was dropped by `DROP`."""
+    fall = np.sqrt(2 * DROP / GRAVITY)
+    if time <= fall:
+        return DROP - GRAVITY * time**2 / 2
+    time, speed = time - fall, BOUNCE * GRAVITY * fall
+    while time > 2 * speed / GRAVITY:
+        time, speed = time - 2 * speed / GRAVITY, BOUNCE * speed
+    return speed * time - GRAVITY * time**2 / 2
+
+
+@pytest.mark.parametrize("box", [None, *(pytest.param(box, marks=pytest.mark.slow) for box in ("beside", "below"))])
+def test_bounces_at_any_time_step(precision, box, gate):
+    """Up to three bounces within a step; the box stays at rest and the other ball in free fall."""
+    model, state = bouncing(box)
+    round_off = {"float32": 4e-6, "float64": 1e-12}[str(precision)]
+    # The bounces are at 0.32, 0.83, 1.24 and 1.57 s: the second step of 0.8 s and that of 1.3 s hold three.
+    for dt, count in [(1 / 240, 300), (1 / 60, 60), (0.1, 15), (0.5, 2), (0.8, 2), (1.3, 1)]:
+        final = advance(with_dt(model, dt), state, count)
+        position, time = np.asarray(final.position, dtype=float), dt * count
+        gap = position[1, 1] - 0.1 - (position[3, 1] + 0.1 if box == "below" else 0.0)
+        # The box sinks by less than the slop, and the ball on it falls by as much further.
+        limit = 5e-5 if box == "below" else round_off
+        gate(f"gap after {count} steps of {dt:.4f} s [m]", gap - height(time), limit)
+        gate("free fall, relative", (50.0 - position[2, 1]) / (GRAVITY * time**2 / 2) - 1, 2e-5)
+        if box:
+            gate("box [m]", position[3] - np.asarray(state.position, dtype=float)[3], 1e-4)
+            gate("box [m/s]", final.velocity[3], 1e-3)
+        assert final.flags == 0
+
+
+def test_more_bounces_than_events_lose_nothing(precision, gate):
+    """Up to nine bounces in a step of three events: the ordinary step takes the rest, and nothing passes the plane."""
+    model, state = bouncing(None)
+    for dt in (0.3, 0.7, 1.0, 2.0):
+        final = advance(with_dt(model, dt), state, 10)
+        gap = float(final.position[1, 1]) - 0.1
+        gate(f"below the plane, dt {dt} [m]", min(gap, 0.0), 1e-3)
+        gate(f"above the start, dt {dt} [m]", max(gap - DROP, 0.0), 0.0)
+
+
+def test_oblique_collision_at_any_time_step(float64, gate):
+    """Benchmark A13a to the digits given: the normal is that of the time of impact."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    surface = {"restitution": 0.9, "friction": 0.0}
+    builder.add_body(Sphere(0.2), mass=1.0, velocity=(2.0, 0.0, 0.0), **surface)
+    builder.add_body(Sphere(0.2), mass=2.0, position=(1.0, 0.2, 0.0), **surface)
+    model, state = builder.build(undamped(impact_events=1))
+    truth = np.array([[0.720910347, -0.738482756, 0.0], [1.639544827, 0.569241378, 0.0]])
+    for count in (1, 3, 60, 240):
+        final = advance(with_dt(model, 1 / count), state, count)
+        gate(f"positions after 1 s in {count} steps [m]", final.position - truth, 2e-9)
+
+
+HALF, TURN = np.array([0.2, 0.1, 0.15]), axis_angle((1.0, 2.0, -0.5), 0.8)
+
+
+def spinning_box(gap, restitution):
+    """A box that flies and spins, its lowest corner `gap` above the plane; no gravity, no friction."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * HALF
+    placed = corners @ rotation_matrix(TURN).T
+    arm = placed[placed[:, 1].argmin()]
+    model, state = body_on_plane(
+        Box(tuple(HALF)),
+        gravity=(0, 0, 0),
+        friction=0.0,
+        restitution=restitution,
+        mass=2.0,
+        position=(0.3, gap - arm[1], 0.1),
+        orientation=tuple(TURN),
+        velocity=(0.4, -1.5, -0.2),
+        angular_velocity=(1.0, -2.0, 0.7),
+        options=undamped(dt=1 / 100, impact_events=3),
+    )
+    return model, state, arm
+
+
+def angular_momentum(model, state):
+    """Of body 1 about its centre of mass, world frame."""
+    rotation = rotation_matrix(state.orientation[1])
+    return rotation @ (np.asarray(model.inertia[1]) * (rotation.T @ np.asarray(state.angular_velocity[1])))
+
+
+def test_corner_of_a_spinning_box(float64, gate):
+    """The impulse of a frictionless impact in one point: (1 + e) u / (1/m + n.(I^-1 (r x n) x r))."""
+    model, state, arm = spinning_box(gap=0.0, restitution=0.7)
+    final = advance(with_dt(model, 1 / 400), state, 1)  # 4 ms later the next corner lands
+    mass, normal = 2.0, np.array([0.0, 1.0, 0.0])
+    rotation = rotation_matrix(TURN)
+    inverse = rotation @ np.diag(1 / np.asarray(model.inertia[1])) @ rotation.T
+    before = np.array([0.4, -1.5, -0.2]) + np.cross([1.0, -2.0, 0.7], arm)
+    around = np.cross(arm, normal)
+    impulse = -(1 + 0.7) * before[1] / (1 / mass + around @ inverse @ around)
+    gate("velocity [m/s]", final.velocity[1] - (np.array([0.4, -1.5, -0.2]) + impulse / mass * normal), 1e-9)
+    change = angular_momentum(model, final) - angular_momentum(model, state)
+    gate("change of the angular momentum", change - impulse * around, 1e-9)
+
+    model, state, _ = spinning_box(gap=0.011, restitution=1.0)
+    for count in (5, 50):
+        final = advance(with_dt(model, 0.05 / count), state, count)
+        assert final.velocity[1, 1] > -1.0, "no impact: the test says nothing"
+        kinetic = [
+            np.asarray(s.velocity[1]) @ np.asarray(s.velocity[1]) * mass
+            + np.asarray(s.angular_velocity[1]) @ angular_momentum(model, s)
+            for s in (state, final)
+        ]
+        gate("energy / start - 1", kinetic[1] / kinetic[0] - 1, 1e-9)
+        gate("horizontal velocity [m/s]", (final.velocity - state.velocity)[1, ::2], 1e-12)
+        gate("vertical angular momentum", angular_momentum(model, final)[1] - angular_momentum(model, state)[1], 1e-12)
+
+
+def test_without_restitution_the_option_changes_nothing(float64):
+    model, state = body_on_plane(Sphere(0.1), position=(0.0, 0.3, 0.0), options=undamped(impact_events=3))
+    plain, _ = body_on_plane(Sphere(0.1), position=(0.0, 0.3, 0.0), options=undamped())
+    split, ordinary = advance(model, state, 30), advance(plain, state, 30)
+    assert (split.position == ordinary.position).all()
+    zero_gap = dataclasses.replace(state, position=jnp.asarray(state.position).at[1, 1].set(0.1))
+    assert (advance(model, zero_gap, 3).position == advance(plain, zero_gap, 3).position).all()
