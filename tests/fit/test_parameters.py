@@ -140,7 +140,7 @@ def test_mistakes_are_named(scene, parameter, message):
 
 
 def test_a_name_twice(scene):
-    with pytest.raises(ValueError, match="'mass.cube.' is given twice"):
+    with pytest.raises(ValueError, match=r"'mass\[cube\]' is given twice"):
         parameter_vector(*scene, ["mass[cube]", "mass[cube]"])
     with pytest.raises(ValueError, match="at least one"):
         parameter_vector(*scene, [])

@@ -64,6 +64,20 @@ def test_restitution_over_several_bounces(drop_objective, start, gate):
     assert not result.warnings
 
 
+def test_multiple_shooting(gate):
+    """Five bounces at once from 0.6, where the whole motion in one piece ends in a wrong minimum."""
+    times = np.arange(151) / 60
+    position = np.zeros((1, 151, 1, 3))
+    position[0, :, 0, 1] = RADIUS + bounce_height(times, 0.8)
+    position += 1e-3 * np.random.default_rng(0).normal(size=position.shape)
+    parameter = Parameter(("restitution[ball]", "restitution[ground]"), start=0.6)
+    data = Trajectories("ball", 1 / 60, position)
+    result = fit(*dropped_ball(), [parameter], data, start="model", segments=10)
+    gate("restitution - 0.8", result.values[0] - 0.8, 2e-3)
+    assert result.lower[0] < 0.8 < result.upper[0]
+    gate("noise factor - 1", result.noise_factor - 1, 0.15)
+
+
 def test_many_starts_run_side_by_side(drop_objective):
     """From 0.6 alone the whole motion leads to a wrong minimum; other starts find the right one and it says so."""
     begin = drop_objective.vector.random_starts(6, seed=0)
@@ -113,8 +127,8 @@ def test_missing_frames(throw_objective, gate):
     position[lost], orientation[lost] = np.nan, np.nan
     orientation[:, 5:, 1] = np.nan
     data = dataclasses.replace(data, position=position, orientation=orientation)
-    near = throw_objective.vector.start[None] * 0.2 + 0.8 * parameter_vector(*struck_ball(), unknown(1.0)).start
-    result = solve(throw_objective.with_data(data), near, huber=3.0)
+    begin = throw_objective.vector.start[None]
+    result = solve(throw_objective.with_data(data), begin, horizons=(0.3, 0.65, 1.0), huber=3.0)
     for label, truth in TRUTH.items():
         gate(f"{label} / truth - 1", result[label] / truth - 1, 0.02)
 

@@ -104,9 +104,9 @@ def test_mistakes_of_a_fit_are_named(data, settings, message):
 
 
 def test_noise_must_be_positive():
-    with pytest.raises(ValueError, match="Noise.position must be a positive"):
+    with pytest.raises(ValueError, match=r"Noise\.position must be a positive"):
         Noise(position=0.0)
-    with pytest.raises(ValueError, match="Noise.orientation"):
+    with pytest.raises(ValueError, match=r"Noise\.orientation"):
         Noise(orientation=None)
 
 
@@ -171,7 +171,7 @@ def test_bad_csv(tmp_path, old, new, message):
 def test_bad_files(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         load(tmp_path / "missing.npz")
-    with pytest.raises(ValueError, match="not from '.txt'"):
+    with pytest.raises(ValueError, match=r"not from .\.txt."):
         load(tmp_path / "motion.txt")
     path = tmp_path / "motion.npz"
     path.write_bytes(b"no archive")
