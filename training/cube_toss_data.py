@@ -122,5 +122,6 @@ def load_tosses(path: Path) -> Tosses:
     length = content["length"].astype(int)
     if outer[0] == 0 or length.min() < 4 or length.max() > outer[1]:
         raise ValueError(f"{path}: length must lie between 4 and the {outer[1]} frames of the arrays")
-    arrays = {name: content[name].astype(float) for name in SHAPES if name != "length"}
-    return Tosses(length, **arrays, **{name: float(content[name]) for name in ("dt", "mass", "half_width")})
+    position, orientation, velocity, angular_velocity = (content[name].astype(float) for name in list(SHAPES)[1:])
+    dt, mass, half_width = (float(content[name]) for name in ("dt", "mass", "half_width"))
+    return Tosses(length, position, orientation, velocity, angular_velocity, dt, mass, half_width)

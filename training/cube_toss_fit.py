@@ -89,7 +89,7 @@ def first_impacts(tosses: Tosses) -> Trajectories:
     speed[:, 0, 0] = velocity - np.outer(GRAVITY * time, [0.0, 0.0, 1.0])
     spin = np.full_like(speed, np.nan)
     spin[:, 0, 0] = rate
-    return Trajectories("cube", tosses.dt, **channels, velocity=speed, angular_velocity=spin)
+    return Trajectories(("cube",), tosses.dt, **channels, velocity=speed, angular_velocity=spin)
 
 
 def cross_entropy(

@@ -45,10 +45,14 @@ def scene(dt: float, mass: float, parameters: CubeParameters) -> tuple[Model, St
     """
     inset = parameters.half_width - parameters.corner_radius
     spheres = [(Sphere(parameters.corner_radius), (corner * inset, (1.0, 0.0, 0.0, 0.0))) for corner in CORNERS]
-    surface = {"friction": parameters.friction, "restitution": parameters.restitution}
+    friction, restitution = parameters.friction, parameters.restitution
     builder = SceneBuilder(gravity=(0.0, 0.0, -GRAVITY))
-    builder.add_body(Plane(normal=(0, 0, 1), offset=0.0), static=True, name="table", **surface)
-    builder.add_body(Compound(spheres), mass=mass, position=(0, 0, 1), name="cube", **surface)
+    builder.add_body(
+        Plane(normal=(0, 0, 1), offset=0.0), static=True, name="table", friction=friction, restitution=restitution
+    )
+    builder.add_body(
+        Compound(spheres), mass=mass, position=(0, 0, 1), name="cube", friction=friction, restitution=restitution
+    )
     model, state = builder.build(Options(dt=dt, linear_damping=0.0, angular_damping=0.0))
     inertia = jnp.full(3, parameters.inertia, model.inertia.dtype)
     size = jnp.asarray(parameters.half_width, model.size.dtype)
