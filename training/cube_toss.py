@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--data", type=Path, required=True, help="the NPZ file")
     parser.add_argument("--output", type=Path, help="Markdown file for the table")
-    parser.add_argument("--rounds", type=int, default=3, help="rounds of the random search (default 3)")
+    parser.add_argument("--rounds", type=int, default=2, help="rounds of the random search (default 2)")
     options = parser.parse_args(arguments)
     try:
         tosses = load_tosses(options.data)
@@ -67,14 +67,13 @@ def report(tosses: Tosses, rounds: int) -> str:
         "| start | fitted to | predicted | position [% of width] | rotation [degree] | parameters |",
         "|---|---|---|---|---|---|",
     ]
-    for setting in SETTINGS:
+    estimates = [fit_tosses(tosses.take(half), SETTINGS, rounds) for half in halves]
+    for number, setting in enumerate(SETTINGS):
         found = []
         for parity, name, other in ((0, "even", "odd"), (1, "odd", "even")):
-            estimate = fit_tosses(tosses.take(halves[parity]), setting, rounds)
-            held_out = tosses.take(halves[1 - parity])
-            position, rotation = errors(held_out, setting, estimate.parameters)
-            found.append((position, rotation))
-            lines.append(f"| {setting} | {name} | {other} | {_figures(position, rotation)} | {_describe(estimate)} |")
+            estimate = estimates[parity][number]
+            found.append(errors(tosses.take(halves[1 - parity]), setting, estimate.parameters))
+            lines.append(f"| {setting} | {name} | {other} | {_figures(*found[-1])} | {_describe(estimate)} |")
         position, rotation = (np.concatenate(part) for part in zip(*found, strict=True))
         lines.append(f"| {setting} | other half | all | {_figures(position, rotation)} | |")
         for peer, (peer_position, peer_rotation) in PEERS[setting].items():

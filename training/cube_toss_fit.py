@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +21,8 @@ FIRST = CubeParameters(friction=0.18, restitution=0.125, inertia=8.1e-4, corner_
 SPREAD = (0.01, 0.06, 1e-4, 2e-3)
 """Standard deviations of the first round of the search: friction, restitution, inertia, corner radius."""
 
-ROUND_SIZE = 40
-ELITE = 8
+ROUND_SIZE = 30
+ELITE = 6
 WEIGHTS = (1 / 11.0, 1 / 13.0)
 """Of position and rotation errors in the objective of the search: about as much of each."""
 
@@ -35,8 +35,8 @@ class Estimate(NamedTuple):
     friction_interval: tuple[float, float]
 
 
-def fit_tosses(tosses: Tosses, setting: str, rounds: int, seed: int = 0) -> Estimate:
-    """Fits friction, restitution, inertia and corner radius.
+def fit_tosses(tosses: Tosses, settings: Sequence[str], rounds: int, seed: int = 0) -> list[Estimate]:
+    """Fits friction, restitution, inertia and corner radius, for each setting.
 
     Gradients of whole tosses explode: near an edge or corner balance a small change turns up another face. So least
     squares with a robust loss sees a short window about the first impact of each toss, and the cross-entropy method
@@ -44,18 +44,26 @@ def fit_tosses(tosses: Tosses, setting: str, rounds: int, seed: int = 0) -> Esti
     """
     first = FIRST._replace(half_width=tosses.resting_half_width())
     result = fit_first_impacts(tosses, first)
-    friction, restitution = result.values[:2]
-    begin = first._replace(
-        friction=float(friction), restitution=float(restitution), inertia=float(first.inertia * result.values[2])
-    )
-    start = start_of(tosses, setting)
+    friction, restitution, factor = (float(value) for value in result.values)
+    begin = first._replace(friction=friction, restitution=restitution, inertia=first.inertia * factor)
+    interval = (float(result.lower[0]), float(result.upper[0]))
+    return [
+        Estimate(_refined(tosses, start_of(tosses, setting), begin, rounds, seed), friction, interval)
+        for setting in settings
+    ]
+
+
+def _refined(
+    tosses: Tosses, start: tuple[np.ndarray, ...], begin: CubeParameters, rounds: int, seed: int
+) -> CubeParameters:
+    """The parameters of least errors over whole tosses, near given ones."""
 
     def objective(row: np.ndarray) -> float:
         position, rotation = prediction_errors(tosses, start, begin._replace(**_named(row)))
         return WEIGHTS[0] * position.mean() + WEIGHTS[1] * rotation.mean()
 
     best = cross_entropy(objective, np.asarray(begin[:4]), np.asarray(SPREAD), rounds, seed)
-    return Estimate(begin._replace(**_named(best)), float(friction), (float(result.lower[0]), float(result.upper[0])))
+    return begin._replace(**_named(best))
 
 
 def fit_first_impacts(tosses: Tosses, first: CubeParameters) -> FitResult:
