@@ -78,10 +78,11 @@ def clean_throws(count=4, seed=1):
     return Trajectories(("ball", "striker"), FRAME, **channels)
 
 
-def noisy(data, seed):
-    """Positions and orientations with noise, without velocities."""
+def noisy(data, seed, with_velocity=False):
+    """Positions and orientations with noise; velocities, of which residuals know nothing, only help to begin."""
     random = np.random.default_rng(seed)
     position = data.position + NOISE.position * random.normal(size=data.position.shape)
     turn = NOISE.orientation * random.normal(size=(*data.orientation.shape[:-1], 3))
     orientation = np.asarray(turned(turn, data.orientation), float)
-    return Trajectories(data.bodies, data.dt, position, orientation)
+    velocities = (data.velocity, data.angular_velocity) if with_velocity else (None, None)
+    return Trajectories(data.bodies, data.dt, position, orientation, *velocities)

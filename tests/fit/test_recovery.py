@@ -140,7 +140,8 @@ def test_intervals_cover_the_truth(throw_objective, gate):
     held = dict.fromkeys(TRUTH, 0)
     errors = {label: [] for label in TRUTH}
     for seed in range(200):
-        result = solve(throw_objective.with_data(noisy(clean_throws(), 1000 + seed)), begin)
+        data = noisy(clean_throws(), 1000 + seed, with_velocity=True)
+        result = solve(throw_objective.with_data(data), begin)
         for label, truth in TRUTH.items():
             low, high = result.interval(label)
             held[label] += low <= truth <= high
