@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+from tests.marks import QUICK_COMPILER
 from tests.shortfalls import SHORTFALLS, TIMINGS
 
 MEMORY_MAPS = Path("/proc/self/maps")
@@ -22,10 +23,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keeps compiled programs between runs.
+    """Compiles quickly, and keeps compiled programs between runs.
 
-    JAX writes cache entries without a lock, so parallel pytest-xdist workers get a directory each.
+    `make test-slow` compiles as users do. JAX writes cache entries without a lock, so parallel pytest-xdist workers get a
+    directory each.
     """
+    if config.getoption("markexpr") == "not slow":
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILER}".strip()
     worker = os.environ.get("PYTEST_XDIST_WORKER", "main")
     cache = config.rootpath / ".pytest_cache" / "jax" / worker
     cache.mkdir(parents=True, exist_ok=True)

@@ -42,5 +42,5 @@ def compact_contacts(
 
     (a, pose_a), (b, pose_b) = placed(group.kind_a, pair[0]), placed(group.kind_b, pair[1])
     manifold = PAIRS[group.kind_a, group.kind_b].function(a, pose_a, b, pose_b)
-    found = flatten(manifold, group.place_count)
+    found = flatten(manifold, active.shape[0])
     return found._replace(active=found.active & jnp.repeat(active, group.point_count, axis=0))

@@ -25,6 +25,7 @@ from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours
 from mathota_jax.solver.pgs import Places
 from mathota_jax.solver.table import TracedTable
+from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.vector import Vec3, norm
 
@@ -93,10 +94,21 @@ def _turns_matter(scene: Scene, model: Model) -> bool:
 
 def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:
     """Runs the narrow phase for the close pairs, a set for each compact group."""
-    return [
-        compact_contacts(model.scene, group, model.shapes, bodies.position, bodies.orientation, p.pair, p.active)
-        for group, p in zip(model.scene.compact_groups, close.groups, strict=True)
-    ]
+    scene, found = model.scene, []
+    assert scene.broadphase is not None
+    for group, places in zip(scene.compact_groups, close.groups, strict=True):
+
+        def contacts(pairs: tuple, group: CompactGroup = group) -> ContactSet:
+            return compact_contacts(scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
+
+        pairs = (places.pair, places.active)
+        if scene.broadphase.one_by_one:
+            (_, placed), *_ = places.tables
+            assert placed.places.turns is not None
+            found.append(map_filled(contacts, pairs, placed.places.turns))
+        else:
+            found.append(contacts(pairs))
+    return found
 
 
 def pair_keys(scene: Scene, close: ClosePairs) -> Array:

@@ -8,6 +8,7 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -39,6 +40,7 @@ from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.pgs import Places, Rows
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
+from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
@@ -201,6 +203,28 @@ def contact_rows(
         scene.options.slop * size,
         size,
     )
+
+
+def rows_one_by_one(
+    scene: Scene, table: TracedTable, model: Model, contacts: ContactSet, motion: Motion, pairs: PlacedPairs
+) -> ContactRows:
+    """`contact_rows` of a table with one pair a turn, without those of the turns that hold none (they are 0)."""
+    blocks, turns = pairs.places.blocks, pairs.places.turns
+    assert turns is not None
+
+    def by_turn(values: Array) -> Array:
+        return values.reshape(table.turn_count, -1, *values.shape[1:])
+
+    def rows(of_turns: tuple[ContactSet, tuple[Array, ...], PlacedPairs]) -> ContactRows:
+        chosen, blocks, pairs = of_turns
+        chosen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), chosen)
+        part = dataclasses.replace(table, turn_count=blocks[0].shape[0], first_slot=0)
+        found = contact_rows(scene, part, model, chosen, motion, pairs._replace(places=Places(blocks, None)))
+        return found._replace(rows=dataclasses.replace(found.rows, places=None))
+
+    chosen = jax.tree.map(by_turn, select(table, contacts))
+    found = map_filled(rows, (chosen, blocks, pairs._replace(places=None)), turns)
+    return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
 
 
 def _row_bound(

@@ -87,8 +87,11 @@ def constrain(
         contact_rows = [
             contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)
         ]
+        rows_of_places = (
+            contact.rows_one_by_one if scene.broadphase and scene.broadphase.one_by_one else contact.contact_rows
+        )
         contact_rows += [
-            contact.contact_rows(scene, table, model, contacts, motion, pairs)
+            rows_of_places(scene, table, model, contacts, motion, pairs)
             for group in (close.groups if close else ())
             for table, pairs in group.tables
         ]

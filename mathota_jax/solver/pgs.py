@@ -223,7 +223,9 @@ def _gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
 
 def _store_of_blocks(values: Array, blocks: Array) -> Array:
     """`store` for (component, constraint, world), linear in the values."""
-    return store(values, jnp.broadcast_to(blocks.astype(values.dtype), values.shape))
+    # Different for each component: by a divisor that they share, XLA would multiply, and copy the product.
+    numbers = jnp.arange(values.shape[0], dtype=blocks.dtype)[:, None, None]
+    return store(values, (blocks + numbers).astype(values.dtype))
 
 
 def _receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:

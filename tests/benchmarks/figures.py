@@ -155,7 +155,8 @@ def _compile_time(result: dict) -> Iterator[Figure]:
         value = times["compile_seconds"]
         settings = (
             f"trace {times['trace_seconds']:.2f} s + XLA {times['xla_seconds']:.2f} s of wall time in a fresh process "
-            f"without cache; {times['compile_cpu_seconds']:.2f} CPU-seconds"
+            f"without cache; {times['compile_cpu_seconds']:.2f} CPU-seconds; XLA {times['older_xla_seconds']:.2f} s with "
+            "`XLA_FLAGS=--xla_cpu_use_fusion_emitters=false`"
         )
         yield Figure(
             f"compile time of a step, {name}", f"{value:.2f} s", f"at most {target:g} s", value <= target, settings

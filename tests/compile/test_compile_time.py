@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.marks import QUICK_COMPILER
+
 ROOT = Path(__file__).resolve().parents[2]
 
 PROGRAM = """
@@ -25,9 +27,10 @@ jax.block_until_ready(compiled(model, state))
 """
 
 
+@pytest.mark.parametrize("flags", ["", QUICK_COMPILER], ids=["default", "quick"])
 @pytest.mark.parametrize(("count", "limit"), [(1, 2.0), (10, 6.0)])
-def test_compile_time_of_a_step(count, limit, gate):
-    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+def test_compile_time_of_a_step(count, limit, flags, gate):
+    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false", "XLA_FLAGS": flags}
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(count)], capture_output=True, text=True, env=environment, timeout=300
