@@ -87,7 +87,7 @@ class Tosses:
         position, velocity = np.linalg.lstsq(design, self.position[toss, :frames] + fall, rcond=None)[0]
         seen = Rotation.from_quat(self.orientation[toss, :frames][:, [1, 2, 3, 0]])
         begin, rate = seen[0], self.angular_velocity[toss, 0].copy()
-        for _ in range(6):  # Gauss-Newton; the first one is right to a percent
+        for _ in range(20):  # Gauss-Newton with the Jacobian of small turns: linear convergence
             error = (seen * (Rotation.from_rotvec(rate * time[:, None]) * begin).inv()).as_rotvec()
             turn, change = np.linalg.lstsq(design, error, rcond=None)[0]
             begin, rate = Rotation.from_rotvec(turn) * begin, rate + change
