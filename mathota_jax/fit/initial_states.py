@@ -1,0 +1,170 @@
+"""Where simulated trajectories and the segments of multiple shooting begin: guesses from the data, and changes of them.
+
+A *motion* is a tuple (position (body, 3), orientation (body, 4), velocity (body, 3), angular velocity (body, 3)) of all
+bodies of the scene; its chart has 12 numbers for each moving body: displacement [m], rotation vector [rad], change of
+velocity [m/s] and of angular velocity [rad/s], world frame.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from scipy.spatial.transform import Rotation
+
+from mathota_jax.fit.arrays import rotation_between, turned
+from mathota_jax.fit.trajectories import Trajectories
+from mathota_jax.model import Model
+from mathota_jax.state import State
+
+Motion = tuple[Any, Any, Any, Any]
+
+CHART = 12
+"""Numbers of the chart for each moving body."""
+
+WINDOW = 5
+"""Frames from which a velocity is guessed."""
+
+
+def motion_of(state: State) -> Motion:
+    """The motion of all bodies."""
+    return state.position, state.orientation, state.velocity, state.angular_velocity
+
+
+def with_motion(state: State, motion: Motion) -> State:
+    """The state with another motion."""
+    position, orientation, velocity, angular_velocity = motion
+    return dataclasses.replace(
+        state,
+        position=position,
+        orientation=orientation,
+        velocity=velocity,
+        angular_velocity=angular_velocity,
+    )
+
+
+def changed(motion: Motion, chart: Array, moving: tuple[int, ...]) -> Motion:
+    """The motion at a point (moving * 12,) of its chart; differentiable."""
+    position, orientation, velocity, angular_velocity = motion
+    step = jnp.reshape(chart, (len(moving), 4, 3))
+    index = jnp.asarray(moving)
+    return (
+        position.at[index].add(step[:, 0]),
+        orientation.at[index].set(turned(step[:, 1], orientation[index])),
+        velocity.at[index].add(step[:, 2]),
+        angular_velocity.at[index].add(step[:, 3]),
+    )
+
+
+def difference(first: Motion, second: Motion, moving: tuple[int, ...]) -> Array:
+    """Chart (moving * 12,) of `second` about `first`; differentiable."""
+    index = jnp.asarray(moving)
+    turn = rotation_between(first[1][index], second[1][index])
+    shift, speed, spin = (second[leaf][index] - first[leaf][index] for leaf in (0, 2, 3))
+    return jnp.ravel(jnp.stack((shift, turn, speed, spin), 1))
+
+
+def guesses(model: Model, state: State, data: Trajectories, frames: list[int], recorded: bool) -> Motion:
+    """Motions of all bodies at some frames of each trajectory, leaves (trajectory, frame, body, ...), NumPy float64.
+
+    Positions and orientations are those recorded at the frame, or the nearest recorded ones moved along by the velocity;
+    velocities are recorded ones, or the slope over the nearest frames. Bodies and channels that were not recorded keep
+    the state of the scene.
+
+    Args:
+        model: the scene.
+        state: what holds for bodies and channels that were not recorded.
+        data: recorded motions.
+        frames: indices of the frames.
+        recorded: the first frame must be recorded in full, velocities included.
+
+    Raises:
+        ValueError: `recorded`, and it is not.
+    """
+    if recorded:
+        _check_recorded(data)
+    names = model.scene.body_names
+    outer = (data.count, len(frames))
+    motion = [np.broadcast_to(np.asarray(leaf, float), (*outer, *leaf.shape)).copy() for leaf in motion_of(state)]
+    for column, body in enumerate(data.bodies):
+        index = names.index(body)
+        for trajectory in range(data.count):
+            for place, frame in enumerate(frames):
+                found = _guess(data, trajectory, column, frame)
+                for leaf, value in zip(motion, found, strict=True):
+                    if value is not None:
+                        leaf[trajectory, place, index] = value
+    return tuple(motion)  # type: ignore[return-value]
+
+
+def _check_recorded(data: Trajectories) -> None:
+    for name in ("position", "orientation", "velocity", "angular_velocity"):
+        value = getattr(data, name)
+        if value is None:
+            raise ValueError(f'fit: start="recorded" needs the {name} of every body in frame 0; use start="free"')
+        missing = np.isnan(value[:, 0]).any(-1)
+        if missing.any():
+            trajectory, body = np.argwhere(missing)[0]
+            raise ValueError(
+                f"fit: start=\"recorded\" needs the {name} of '{data.bodies[body]}' in frame 0 of trajectory {trajectory}, "
+                'which is NaN; use start="free"'
+            )
+
+
+def _guess(data: Trajectories, trajectory: int, body: int, frame: int) -> list[np.ndarray | None]:
+    position, velocity = _linear(data, "position", "velocity", trajectory, body, frame)
+    if data.orientation is None:
+        return [position, None, velocity, _at(data.angular_velocity, trajectory, body, frame)]
+    orientation, angular_velocity = _rotation(data, trajectory, body, frame)
+    return [position, orientation, velocity, angular_velocity]
+
+
+def _at(channel: np.ndarray | None, trajectory: int, body: int, frame: int) -> np.ndarray | None:
+    if channel is None or np.isnan(channel[trajectory, frame, body]).any():
+        return None
+    return channel[trajectory, frame, body]
+
+
+def _nearest(channel: np.ndarray, frame: int) -> np.ndarray:
+    """The complete frames nearest to a frame, in order of time."""
+    complete = np.flatnonzero(~np.isnan(channel).any(-1))
+    return np.sort(complete[np.argsort(np.abs(complete - frame), kind="stable")[:WINDOW]])
+
+
+def _linear(
+    data: Trajectories, value: str, rate: str, trajectory: int, body: int, frame: int
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    channel = getattr(data, value)[trajectory, :, body]
+    near = _nearest(channel, frame)
+    slope = _at(getattr(data, rate), trajectory, body, frame)
+    if len(near) == 0:
+        return None, slope
+    closest = near[np.argmin(np.abs(near - frame))]
+    if slope is None and len(near) > 1:
+        time = (near - near.mean()) * data.dt
+        slope = time @ channel[near] / (time @ time)
+    moved = channel[closest] + (0.0 if slope is None else slope * (frame - closest) * data.dt)
+    return moved, slope
+
+
+def _rotation(
+    data: Trajectories, trajectory: int, body: int, frame: int
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    assert data.orientation is not None
+    channel = data.orientation[trajectory, :, body]
+    near = _nearest(channel, frame)
+    rate = _at(data.angular_velocity, trajectory, body, frame)
+    if len(near) == 0:
+        return None, rate
+    turns = Rotation.from_quat(channel[near][:, [1, 2, 3, 0]])
+    closest = int(np.argmin(np.abs(near - frame)))
+    if rate is None and len(near) > 1:
+        steps = (turns[1:] * turns[:-1].inv()).as_rotvec() / (np.diff(near)[:, None] * data.dt)
+        rate = steps.mean(0)
+    moved = turns[closest]
+    if rate is not None:
+        moved = Rotation.from_rotvec(rate * (frame - near[closest]) * data.dt) * moved
+    return moved.as_quat()[[3, 0, 1, 2]], rate

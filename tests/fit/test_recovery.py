@@ -1,0 +1,172 @@
+"""Known parameters are found again from data made with them, with honest intervals."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from mathota_jax import Plane, SceneBuilder, Sphere
+from mathota_jax.fit import Noise, Parameter, Trajectories, fit
+from mathota_jax.fit.fitting import solve
+from mathota_jax.fit.objective import Objective
+from mathota_jax.fit.parameters import parameter_vector
+from tests.fit.scenes import FRAME, GRAVITY, NOISE, SUBSTEPS, TRUTH, clean_throws, noisy, struck_ball, unknown
+from tests.scenes import undamped
+
+RADIUS = 0.1
+
+
+def bounce_height(times, restitution, drop=1.0):
+    """Height of a ball above its resting height after it was dropped: parabolas between impacts (BENCHMARKS A12a)."""
+    heights = []
+    for time in times:
+        if time < (first := math.sqrt(2 * drop / GRAVITY)):
+            heights.append(drop - GRAVITY * time**2 / 2)
+            continue
+        time, speed = time - first, restitution * GRAVITY * first
+        while time > 2 * speed / GRAVITY:
+            time, speed = time - 2 * speed / GRAVITY, speed * restitution
+        heights.append(speed * time - GRAVITY * time**2 / 2)
+    return np.asarray(heights)
+
+
+def dropped_ball():
+    builder = SceneBuilder(gravity=(0.0, -GRAVITY, 0.0))
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, restitution=0.9, name="ground")
+    builder.add_body(Sphere(RADIUS), mass=1.0, restitution=0.9, position=(0, 1 + RADIUS, 0), name="ball")
+    return builder.build(undamped())
+
+
+def drops(restitution=0.8):
+    """20 heights in 2.5 s; nothing else was recorded."""
+    position = np.full((1, 21, 1, 3), np.nan)
+    position[0, :, 0, 1] = RADIUS + bounce_height(np.linspace(0, 2.5, 21), restitution)
+    return Trajectories("ball", 2.5 / 20, position)
+
+
+@pytest.fixture(scope="module")
+def drop_objective():
+    """Restitution by the heights, compiled once."""
+    model, state = dropped_ball()
+    parameter = Parameter(("restitution[ball]", "restitution[ground]"))
+    vector = parameter_vector(model, state, [parameter])
+    return Objective(model, state, vector, drops(), Noise(), segment_count=1, substeps=30, start="model")
+
+
+@pytest.mark.parametrize("start", [0.6, 0.95])
+def test_restitution_over_several_bounces(drop_objective, start, gate):
+    """BENCHMARKS C8: |e - 0.8| < 1e-3 in at most 100 steps, from far below and above."""
+    begin = np.asarray([[math.log(start / (1 - start))]])
+    result = solve(drop_objective, begin, horizons=(0.3, 0.6, 1.0), step_limit=100)
+    gate("restitution - 0.8", result.values[0] - 0.8, 1e-3)
+    assert result.converged and result.steps <= 100
+    assert not result.warnings
+
+
+def test_multiple_shooting(gate):
+    """Five bounces at once from 0.6, where the whole motion in one piece ends in a wrong minimum."""
+    times = np.arange(151) / 60
+    position = np.zeros((1, 151, 1, 3))
+    position[0, :, 0, 1] = RADIUS + bounce_height(times, 0.8)
+    position += 1e-3 * np.random.default_rng(0).normal(size=position.shape)
+    parameter = Parameter(("restitution[ball]", "restitution[ground]"), start=0.6)
+    data = Trajectories("ball", 1 / 60, position)
+    result = fit(*dropped_ball(), [parameter], data, start="model", segments=10)
+    gate("restitution - 0.8", result.values[0] - 0.8, 2e-3)
+    assert result.lower[0] < 0.8 < result.upper[0]
+    gate("noise factor - 1", result.noise_factor - 1, 0.15)
+
+
+def test_many_starts_run_side_by_side(drop_objective):
+    """From 0.6 alone the whole motion leads to a wrong minimum; other starts find the right one and it says so."""
+    begin = drop_objective.vector.random_starts(6, seed=0)
+    begin[0] = math.log(0.6 / 0.4)
+    result = solve(drop_objective, begin)
+    assert abs(result.starts[0].values[0] - 0.8) > 0.01
+    assert abs(result.values[0] - 0.8) < 1e-3
+    assert len(result.starts) == 6
+
+
+def test_a_wrong_model_is_reported(drop_objective):
+    """A ball that loses a tenth of its height whatever it does has no restitution."""
+    data = drops()
+    position = data.position * np.linspace(1.0, 0.5, 21)[None, :, None, None]
+    result = solve(drop_objective.with_data(dataclasses.replace(data, position=position)), np.asarray([[1.0]]))
+    assert any("times the noise given" in warning for warning in result.warnings)
+
+
+@pytest.fixture(scope="module")
+def throw_objective():
+    """Four parameters by noisy throws, compiled once."""
+    model, state = struck_ball()
+    vector = parameter_vector(model, state, unknown(1.15))
+    return Objective(model, state, vector, noisy(clean_throws(), 0), NOISE, 1, SUBSTEPS, "free")
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_friction_restitution_mass_and_size(throw_objective, seed, gate):
+    """Each to 1 % from positions with 1 mm and orientations with 1 degree of noise, from a start 10 % to 15 % away.
+
+    From so far one start does not always do: with the noise of seeds 1 and 2 it ends in a wrong minimum, which the warning
+    about the residuals tells.
+    """
+    data = noisy(clean_throws(), seed, with_velocity=True)
+    begin = throw_objective.vector.start[None]
+    result = solve(throw_objective.with_data(data), begin, horizons=(0.3, 0.5, 0.65, 0.8, 1.0))
+    for label, truth in TRUTH.items():
+        gate(f"{label} / truth - 1", result[label] / truth - 1, 0.01)
+        low, high = result.interval(label)
+        assert low < high < low + 0.04 * truth
+    assert abs(result.noise_factor - 1) < 0.05
+    assert not result.warnings
+
+
+def test_missing_frames(throw_objective, gate):
+    """A third of the frames, and all orientations of the striker, are missing."""
+    data = noisy(clean_throws(), 2, with_velocity=True)
+    position, orientation = data.position.copy(), data.orientation.copy()
+    lost = np.random.default_rng(0).random(position.shape[:3]) < 1 / 3
+    position[lost], orientation[lost] = np.nan, np.nan
+    orientation[:, 5:, 1] = np.nan
+    data = dataclasses.replace(data, position=position, orientation=orientation)
+    begin = throw_objective.vector.start[None]
+    result = solve(throw_objective.with_data(data), begin, horizons=(0.3, 0.65, 1.0), huber=3.0)
+    for label, truth in TRUTH.items():
+        gate(f"{label} / truth - 1", result[label] / truth - 1, 0.02)
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth(throw_objective, gate):
+    """95 % intervals hold the truth in 95 % of 200 repetitions, within the binomial spread of such a count."""
+    begin = parameter_vector(*struck_ball(), unknown(1.0)).start[None]
+    held = dict.fromkeys(TRUTH, 0)
+    errors = {label: [] for label in TRUTH}
+    for seed in range(200):
+        data = noisy(clean_throws(), 1000 + seed, with_velocity=True)
+        result = solve(throw_objective.with_data(data), begin)
+        for label, truth in TRUTH.items():
+            low, high = result.interval(label)
+            held[label] += low <= truth <= high
+            errors[label].append(result[label] / truth - 1)
+    for label, count in held.items():
+        print(f"{label}: {count} of 200, rms error {np.sqrt(np.mean(np.square(errors[label]))):.5f}")
+        gate(f"{label}: coverage - 0.95", count / 200 - 0.95, 3 * math.sqrt(0.95 * 0.05 / 200))
+
+
+def test_undetermined_parameters_are_named():
+    """The mass of a body that falls alone, and size and friction of one that touches nothing, leave no trace."""
+    builder = SceneBuilder(gravity=(0.0, -GRAVITY, 0.0))
+    builder.add_body(Plane(normal=(0, 1, 0), offset=-100.0), static=True, name="ground")
+    builder.add_body(Sphere(RADIUS), mass=1.0, name="ball")
+    time = np.arange(9) * FRAME
+    position = np.zeros((1, 9, 1, 3))
+    position[0, :, 0, 1] = -9.0 * time**2 / 2 + 1e-4 * np.random.default_rng(0).normal(size=9)
+    data = Trajectories("ball", FRAME, position)
+    model, state = builder.build(undamped())
+    result = fit(model, state, ["mass[ball]", "friction[ball]", "gravity"], data, start="model", noise=Noise(1e-4))
+    assert abs(result["gravity"] - 9.0) < 0.05
+    assert result.interval("mass[ball]") == (0.0, np.inf)
+    for label in ("mass[ball]", "friction[ball]"):
+        assert any(f"'{label}' is not determined" in warning for warning in result.warnings)
+    assert not any("gravity" in warning for warning in result.warnings)

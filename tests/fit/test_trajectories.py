@@ -1,0 +1,192 @@
+"""Recorded motions: what is refused, and that files come back as they were written."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mathota_jax import Plane, SceneBuilder, Sphere
+from mathota_jax.fit import Noise, Trajectories, fit, load, load_csv, load_npz, save_npz
+
+NAN = float("nan")
+
+
+def example(**changes):
+    """Two trajectories of three frames of two bodies."""
+    random = np.random.default_rng(0)
+    orientation = random.normal(size=(2, 3, 2, 4))
+    given = {
+        "bodies": ("ball", "cube"),
+        "dt": 0.01,
+        "position": random.normal(size=(2, 3, 2, 3)),
+        "orientation": orientation / np.linalg.norm(orientation, axis=-1, keepdims=True),
+        **changes,
+    }
+    return Trajectories(**given)
+
+
+def changed(name, where, value):
+    array = np.array(getattr(example(), name))
+    array[where] = value
+    return {name: array}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"position": np.zeros((3, 2, 3))},
+            r"position must have shape \(trajectory, frame, body, 3\), got \(3, 2, 3\)",
+        ),
+        ({"position": np.zeros((2, 3, 1, 3))}, r"position must have shape \(2, 3, 2, 3\)"),
+        ({"orientation": np.zeros((2, 3, 2, 3))}, r"orientation must have shape \(2, 3, 2, 4\)"),
+        ({"velocity": np.zeros((2, 2, 2, 3))}, "velocity must have shape"),
+        ({"position": np.zeros((0, 3, 2, 3)), "orientation": None}, "there is no trajectory"),
+        ({"position": np.zeros((2, 0, 2, 3)), "orientation": None}, "at least 2 frames, got 0"),
+        ({"position": np.zeros((2, 1, 2, 3)), "orientation": None}, "at least 2 frames, got 1"),
+        (changed("position", np.s_[:, :, 1], NAN), "position of 'cube' is NaN in every frame"),
+        (changed("orientation", np.s_[:, :, 0], NAN), "orientation of 'ball' is NaN in every frame"),
+        (
+            {**changed("position", np.s_[1, 1:], NAN), "orientation": None},
+            "trajectory 1 holds nothing after its first frame",
+        ),
+        (changed("position", np.s_[0, 0, 0, 0], np.inf), "position holds infinite numbers"),
+        (
+            changed("orientation", np.s_[1, 2, 1, 3], NAN),
+            "orientation of 'cube' in frame 2 of trajectory 1 is NaN in part",
+        ),
+        (changed("orientation", np.s_[1, 2, 1], 1.0), "frame 2 of trajectory 1 has the length 2"),
+        ({"position": "motion"}, "position must be an array of numbers"),
+        ({"dt": 0.0}, "dt must be a positive number"),
+        ({"dt": [0.1, 0.2]}, "dt must be one number"),
+        ({"bodies": ("ball", "ball")}, "different names"),
+        ({"action": np.zeros((2, 3, 1))}, r"action must have shape \(2, 2, motor\)"),
+        ({"action": np.full((2, 2, 1), NAN)}, "action must not hold NaN"),
+    ],
+)
+def test_mistakes_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        example(**changes)
+
+
+def ball_scene():
+    builder = SceneBuilder()
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, name="ground")
+    builder.add_body(Sphere(0.1), mass=1.0, position=(0, 1, 0), name="ball")
+    return builder.build()
+
+
+def ball_data(**changes):
+    return Trajectories(**{"bodies": "ball", "dt": 0.01, "position": np.zeros((1, 5, 1, 3)), **changes})
+
+
+@pytest.mark.parametrize(
+    ("data", "settings", "message"),
+    [
+        (example(), {}, "the scene has no body 'cube'; known: 'ground', 'ball'"),
+        (ball_data(bodies="ground"), {}, "body 'ground' is static"),
+        (ball_data(action=np.zeros((1, 4, 2))), {}, "each of the 0 motors"),
+        (ball_data(), {"start": "recorded"}, "needs the orientation"),
+        (ball_data(), {"start": "somewhere"}, "start must be one of 'recorded', 'free', 'model'"),
+        (ball_data(), {"parameters": ["velocity[ball]"]}, 'need start="model"'),
+        (ball_data(), {"segments": 9}, "at most the 4 frames"),
+        (ball_data(), {"segments": 2, "horizons": (0.5, 1.0)}, "not both"),
+        (ball_data(), {"horizons": (0.5, 0.4, 1.0)}, "horizons must be positive and increasing"),
+        (ball_data(), {"substeps": 0}, "substeps must be a whole number"),
+        (ball_data(), {"huber": -1.0}, "huber must be a positive number"),
+        (ball_data(), {"confidence": 95}, "confidence must lie between 0 and 1"),
+        (np.zeros((1, 5, 1, 3)), {}, "data must be Trajectories"),
+    ],
+)
+def test_mistakes_of_a_fit_are_named(data, settings, message):
+    with pytest.raises(ValueError, match=message):
+        fit(*ball_scene(), **{"parameters": ["gravity"], "data": data, **settings})
+
+
+def test_noise_must_be_positive():
+    with pytest.raises(ValueError, match=r"Noise\.position must be a positive"):
+        Noise(position=0.0)
+    with pytest.raises(ValueError, match=r"Noise\.orientation"):
+        Noise(orientation=None)
+
+
+def test_npz_comes_back(tmp_path):
+    data = example(velocity=np.ones((2, 3, 2, 3)), **changed("position", np.s_[1, 2, 0], NAN))
+    save_npz(tmp_path / "motion.npz", data)
+    again = load(tmp_path / "motion.npz")
+    assert again.bodies == data.bodies and again.dt == data.dt
+    for name, value in data.channels.items():
+        np.testing.assert_allclose(getattr(again, name), value)
+
+
+def test_npz_of_one_trajectory(tmp_path):
+    np.savez(tmp_path / "motion.npz", dt=0.1, bodies=["ball"], position=np.zeros((4, 1, 3)))
+    assert load_npz(tmp_path / "motion.npz").position.shape == (1, 4, 1, 3)
+
+
+CSV = """trajectory,time,body,x,y,z,qw,qx,qy,qz
+a,0.50,ball,0,1,0,1,0,0,0
+a,0.51,ball,0.1,,0,,,,
+a,0.53,ball,0.3,0.9,0,0,1,0,0
+b,7.00,ball,5,1,0,1,0,0,0
+b,7.01,ball,5,2,0,1,0,0,0
+"""
+
+
+def test_csv(tmp_path):
+    path = tmp_path / "motion.csv"
+    path.write_text(CSV)
+    data = load(path)
+    assert data.bodies == ("ball",) and data.dt == pytest.approx(0.01)
+    expected = np.full((2, 4, 3), NAN)
+    expected[0] = [[0, 1, 0], [0.1, NAN, 0], [NAN] * 3, [0.3, 0.9, 0]]
+    expected[1, :2] = [[5, 1, 0], [5, 2, 0]]
+    np.testing.assert_allclose(data.position[:, :, 0], expected)
+    assert np.isnan(data.orientation[0, 1]).all() and data.orientation[0, 3, 0, 1] == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("time,", "t,", "the column 'time' is missing"),
+        ("qz", "q4", "unknown column 'q4'"),
+        (",qz", "", "the column 'qz' of the orientation is missing"),
+        ("0.51,ball", "0.515,ball", "line 2: the time is"),
+        ("0.3,", "zero,", "line 4: 'zero' in column 'x' is not a number"),
+        ("0.53,", "0.51,", "line 4: body 'ball' has this frame in line 3 already"),
+        ("7.01,", ",", "line 6: the time is missing"),
+        ("b,7.01,ball,5,2,0,1,0,0,0\n", "", "trajectory 1 holds nothing after its first frame"),
+        ("5,2,0,1,0,0,0", "5,2,0", "line 6: expected 10 cells"),
+        (CSV.partition("\n")[2], "", "no line below the header"),
+    ],
+)
+def test_bad_csv(tmp_path, old, new, message):
+    assert old in CSV
+    path = tmp_path / "motion.csv"
+    path.write_text(CSV.replace(old, new))
+    with pytest.raises(ValueError, match=message.replace("line 2: the time", "the time")):
+        load_csv(path)
+
+
+def test_bad_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        load(tmp_path / "missing.npz")
+    with pytest.raises(ValueError, match=r"not from .\.txt."):
+        load(tmp_path / "motion.txt")
+    path = tmp_path / "motion.npz"
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="not an NPZ file"):
+        load(path)
+    np.savez(path, dt=0.1, position=np.zeros((4, 1, 3)))
+    with pytest.raises(ValueError, match="the key 'bodies' is missing"):
+        load(path)
+    np.savez(path, dt=0.1, bodies=["ball"], position=np.zeros((4, 1, 3)), orientaton=np.zeros((4, 1, 4)))
+    with pytest.raises(ValueError, match="unknown key 'orientaton'"):
+        load(path)
+
+
+def test_taking_some_trajectories():
+    data = example()
+    part = data.take([1])
+    assert part.count == 1 and dataclasses.astuple(part)[0] == data.bodies
+    np.testing.assert_allclose(part.position[0], data.position[1])
