@@ -76,17 +76,18 @@ def residual_figure(result: FitResult) -> Figure:
     names, bodies = list(result.residuals), result.data.bodies
     figure, axes = _figure(len(names), 2.4 * len(names), len(bodies))
     time = np.arange(result.data.frame_count) * result.data.dt
+    size = 5 if result.data.count * result.data.frame_count < 500 else 2
     for row, name in enumerate(names):
         for column, body in enumerate(bodies):
             cell = axes[row, column]
             for k, (component, colour) in enumerate(_COMPONENTS):
                 values = result.residuals[name][:, :, column, k]
                 times = np.broadcast_to(time, values.shape)
-                cell.plot(times.ravel(), values.ravel(), ".", markersize=2, alpha=0.5, color=colour, label=component)
+                cell.plot(times.ravel(), values.ravel(), ".", markersize=size, alpha=0.5, color=colour, label=component)
             cell.axhline(0, color="black", linewidth=0.8)
             cell.set(title=f"{body}: {_TITLES[name]}", xlabel="time [s]", ylabel="residual / noise")
             cell.grid(alpha=0.3)
-    axes[0, 0].legend(loc="upper left", fontsize="small", markerscale=4)
+    axes[0, 0].legend(loc="upper left", fontsize="small", markerscale=8 / size)
     return figure
 
 
