@@ -92,6 +92,7 @@ def _features(scene: Scene) -> list[str]:
         "contacts": scene.slot_count > 0,
         "friction": scene.friction and scene.slot_count > 0,
         "restitution": scene.restitution and scene.slot_count > 0,
+        "steps split at impacts": bool(scene.options.impact_events and scene.restitution and scene.pair_groups),
         "joints": bool(scene.joints),
         "exact joints": layout(scene) is not None,
         "gyroscopic torque": not all(scene.spherical[body] for body in scene.dynamic_bodies),

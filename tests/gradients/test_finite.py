@@ -18,12 +18,19 @@ EVERYTHING = ("sphere", "sphere", "box", "box", "capsule", "capsule")
 
 
 def scene(kinds, restitution):
-    """Bodies of some kinds on a plane, and beside them joints with limits and motors."""
+    """Bodies of some kinds on a plane; of all kinds, beside them joints with limits and motors."""
     builder = SceneBuilder(gravity=DOWN)
     surface = {"friction": 0.5, "restitution": restitution}
     ground = builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, **surface)
     for kind in kinds:
         builder.add_body(SHAPES[kind], mass=1.0, **surface)
+    if kinds == EVERYTHING:
+        add_joints(builder, ground)
+    return builder.build(undamped(dt=1 / 60))
+
+
+def add_joints(builder, ground):
+    """A hinge and a slider."""
     lever = builder.add_body(Box((0.02, 0.1, 0.02)), mass=0.5, position=(5.0, 1.0, 0.0), collides=False)
     hinge = builder.add_joint(
         Hinge(parent=ground, child=lever, anchor=(5, 1.1, 0), axis=(0, 0, 1), limits=(-0.5, 0.5), damping=0.01)
@@ -32,7 +39,6 @@ def scene(kinds, restitution):
     cart = builder.add_body(Sphere(0.1), mass=0.5, position=(7.0, 1.0, 0.0), collides=False)
     slider = builder.add_joint(Slider(parent=ground, child=cart, anchor=(7, 1, 0), axis=(1, 0, 0), limits=(0.0, 0.5)))
     builder.add_motor(slider, kind="torque", limit=1.0)
-    return builder.build(undamped(dt=1 / 60))
 
 
 def placements(count):
@@ -76,17 +82,19 @@ def check_every_gradient(kinds, restitution):
     moving = dataclasses.replace(states, velocity=states.velocity.at[:, free, 1].add(-0.5))
     states = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), states, moving)
     names = [f"{name}, {motion}" for motion in ("at rest", "moving down") for name in names]
-    weights = [np.random.default_rng(3).normal(size=(len(kinds) + 3, size)) for size in (3, 4, 3, 3)]
+    weights = [np.random.default_rng(3).normal(size=(model.scene.body_count, size)) for size in (3, 4, 3, 3)]
 
     def loss(model, state, action):
-        final, _ = rollout(model, state, jnp.broadcast_to(action, (2, 2)))
+        final, _ = rollout(model, state, jnp.broadcast_to(action, (2, *action.shape)))
         leaves = (final.position, final.orientation, final.velocity, final.angular_velocity)
         found = contacts(model, final)
         seen = jnp.sum(found.separation) + jnp.sum(found.normal) + jnp.sum(found.position)
         return sum(jnp.sum(w * leaf) for w, leaf in zip(weights, leaves, strict=True)) + energy(model, final) + seen
 
     gradient = jax.grad(loss, argnums=(0, 1, 2), allow_int=True)
-    batch = jax.jit(jax.vmap(gradient, in_axes=(None, 0, None)))(model, states, jnp.array([0.3, -0.2]))
+    batch = jax.jit(jax.vmap(gradient, in_axes=(None, 0, None)))(
+        model, states, jnp.array([0.3, -0.2][: len(model.scene.motors)])
+    )
     bad = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(batch):
         if leaf.dtype == jax.dtypes.float0:

@@ -42,7 +42,7 @@ def test_what_a_scene_has():
     assert found["broadphase"] == "none"
     present, absent = (set(found[key].split(", ")) for key in ("present", "absent"))
     assert {"friction", "joints", "warm start", "linear damping", "gyroscopic torque"} <= present
-    assert absent == {"restitution", "sleep", "continuous collision"}
+    assert absent == {"restitution", "sleep", "continuous collision", "exact joints", "steps split at impacts"}
     assert "dt=0.0166667" in found["settings"] and "velocity_iterations=10" in found["settings"]
 
 
