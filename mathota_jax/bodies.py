@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mathota_jax.model import Model
@@ -160,3 +162,10 @@ def unpack_blocks(velocity: Array) -> tuple[Vec3, Vec3 | None]:
     """Linear and angular part of blocks."""
     components = unstack(velocity, 0)
     return Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None
+
+
+def smaller_moving(model: Model, first: Sequence[int], second: Sequence[int]) -> Array:
+    """(pair or 1, world) inner radius of the smaller moving body of each pair; infinite if none moves."""
+    static = np.asarray(model.scene.static)
+    sizes = [jnp.where(static[np.asarray(side)][:, None], jnp.inf, take(model.size, side)) for side in (first, second)]
+    return jnp.minimum(*sizes)

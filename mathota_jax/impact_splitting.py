@@ -20,6 +20,7 @@ from mathota_jax.model import Model
 from mathota_jax.outcome import forces, merge, new_state
 from mathota_jax.phases import correct_positions, external, free_velocities, gravity, solve_rows
 from mathota_jax.scene import Scene
+from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.state import State
 
@@ -40,7 +41,7 @@ def split_at_impacts(model: Model, state: State, action: Array) -> State:
     """The phases of a step, split at its first impacts; what follows the last of them is an ordinary step."""
     count = model.scene.options.impact_events
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))
-    state = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), state)
+    state = in_every_world(state, worlds)
     begin = _Progress(
         state,
         jnp.broadcast_to(model.dt, (worlds,)),

@@ -21,7 +21,7 @@ from mathota_jax.outcome import merge
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.pgs import Rows, add_impulses
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
@@ -164,7 +164,7 @@ def close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
 
     rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model)))
-    moved = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), moved)
+    moved = in_every_world(moved, worlds)
     return lax.scan(close, moved, jnp.arange(rounds + 1) == rounds)[0]
 
 

@@ -30,6 +30,7 @@ from mathota_jax.phases import (
     solve_rows,
     stop_at_impacts,
 )
+from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.state import Flag, State
 
@@ -122,14 +123,10 @@ def _simulate_or_rest(model: Model, state: State, action: Array) -> State:
     if not (model.scene.options.sleep and model.scene.dynamic_bodies):
         return _simulate(model, state, action)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))
-
-    def every_world(state: State) -> State:
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), state)
-
     return jax.lax.cond(
         sleep.all_rest(model.scene, state, action),
-        lambda model, state, action: every_world(sleep.at_rest(state)),
-        lambda model, state, action: every_world(_simulate(model, state, action)),
+        lambda model, state, action: in_every_world(sleep.at_rest(state), worlds),
+        lambda model, state, action: in_every_world(_simulate(model, state, action), worlds),
         model,
         state,
         action,

@@ -28,3 +28,19 @@ def rest_speed(gravity: Array, dt: Array, size: Array, scale: Array) -> Array:
     """
     rises = jnp.minimum(gravity * dt, jnp.sqrt(2.0 * gravity * TOUCHING * size))
     return jax.lax.stop_gradient(jnp.maximum(rises, ROUND_OFF * jnp.finfo(scale.dtype).eps * scale))
+
+
+def next_touch(gap: Array, rate: Array, bend: Array, near: Array | float = 0.0) -> tuple[Array, Array]:
+    """First time after now at which ``gap + rate t + bend t^2 / 2`` is 0, or is so again for a point that leaves now.
+
+    Returns:
+      The time, infinite where there is none, and the speed then.
+    """
+    gap = jnp.where((gap <= near) & (rate > 0), 0.0, jnp.maximum(gap, 0.0))
+    discriminant = rate * rate - 2.0 * bend * gap
+    speed = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    divisor = speed - rate
+    down = jnp.where(divisor > 0, 2.0 * gap / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
+    falls = bend < 0
+    up = jnp.where(falls, (rate + speed) / jnp.where(falls, -bend, 1.0), jnp.inf)
+    return jnp.where(discriminant < 0, jnp.inf, jnp.where(rate > 0, up, down)), speed

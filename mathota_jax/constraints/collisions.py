@@ -10,15 +10,14 @@ Simultaneous Impact", ACM Trans. Graph. 31(4), 2012: generalized reflections).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.bodies import Bodies, Inertia, moving_inertia, unpack_blocks
+from mathota_jax.bodies import Bodies, Inertia, moving_inertia, smaller_moving, unpack_blocks
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts
-from mathota_jax.collision.rest import TOUCHING, rest_speed
+from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
 from mathota_jax.constraints import contact, joint
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.contact import ContactRows
@@ -42,12 +41,6 @@ ROUNDS = 16
 Impulses = tuple[Array, ...]
 
 
-def pair_restitution(model: Model) -> Array:
-    """(slot, world) of the slots that belong to a pair: the smaller of the two coefficients (guide 8.2)."""
-    smaller = jnp.minimum(*(take(model.restitution, np.asarray(side)) for side in model.scene.slot_bodies))
-    return jnp.broadcast_to(smaller, (model.scene.static_slot_count, smaller.shape[-1]))
-
-
 def foreseen(
     model: Model, problem: Problem, now: Array, then: Array, gravity: Vec3, left: Array
 ) -> tuple[tuple[tuple[Array, Array], ...], Array]:
@@ -67,8 +60,8 @@ def foreseen(
     found, worlds = [], now.shape[-1]
     bounces = jnp.zeros(worlds, bool)
     pull, left = norm(gravity), left[None]
-    fixed = lax.stop_gradient((problem.contact_rows, now, then, pull, left, model.dt, pair_restitution(model)))
-    groups, now, then, pull, left, dt, restitution = fixed
+    fixed = lax.stop_gradient((model, problem.contact_rows, now, then, pull, left))
+    model, groups, now, then, pull, left = fixed
     for group in groups:
         rows = group.rows
         if isinstance(rows.table, TracedTable):
@@ -76,23 +69,14 @@ def foreseen(
             found.append((none, none))
             continue
 
-        def along(velocity: Array, jacobian: Sequence[Array], rows: Rows = rows) -> Array:
-            return pgs.first_row_velocity(rows.table, jacobian, rows.places, velocity)
-
-        start, free = (along(velocity, rows.jacobian) for velocity in (now, then))
-        scale = along(jnp.abs(now), [jnp.abs(side) for side in rows.jacobian])
-        e = pack_scalars(rows.table, [select(rows.table, restitution)], worlds)
+        start, free = (pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, v) for v in (now, then))
+        e = _restitution(model, rows, worlds)
         # One of two bodies that fall may be held: to foresee too much costs a search, too little a contact.
         gap, acceleration = jnp.maximum(group.separation, 0.0), jnp.minimum((free - start) / left, -pull)
-        discriminant = start * start - 2.0 * acceleration * gap
-        speed = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-        falls, divisor = acceleration < 0, speed - start
-        up = jnp.where(falls, (start + speed) / jnp.where(falls, -acceleration, 1.0), jnp.inf)
-        down = jnp.where(divisor > 0, 2.0 * gap / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
-        time = jnp.where(start > 0, up, down)
-        rests = rest_speed(pull, dt, group.size, scale)
-        fast = (jnp.where(e > 0, e, 1.0) * speed > rests) & _acts(rows)
-        reaches = (discriminant >= 0) & (time <= left)
+        time, speed = next_touch(gap, start, acceleration)
+        rests = rest_speed(pull, model.dt, group.size, _speeds(rows, now))
+        fast = (jnp.where(e > 0, e, 1.0) * speed > rests) & (contact.normal_mass(rows) > 0)
+        reaches = time <= left
         # The search follows what is apart; its rows, which extrapolate along one normal, could only disturb it.
         followed = ~reaches & (group.separation > TOUCHING * group.size)
         meets = settle(jnp.where(fast & reaches, 1.0, 0.0)) > 0.5
@@ -103,10 +87,15 @@ def foreseen(
     return tuple(found), bounces
 
 
-def _acts(rows: Rows) -> Array:
-    """(turn, 1, column, world) whether a contact exists."""
-    law = rows.law
-    return (law.normal_mass[:, None] if isinstance(law, Cone) else law.effective_mass) > 0
+def _restitution(model: Model, rows: Rows, worlds: int) -> Array:
+    """(turn, 1, column, world) of contacts that have slots of their own."""
+    return pack_scalars(rows.table, [contact.pair_restitution(model.scene, rows.table, model, None)], worlds)
+
+
+def _speeds(rows: Rows, velocity: Array) -> Array:
+    """(turn, 1, column, world) sum of the speeds of both bodies along the normal of each contact, or more."""
+    sides = [jnp.abs(side) for side in rows.jacobian]
+    return pgs.first_row_velocity(rows.table, sides, rows.places, jnp.abs(velocity))
 
 
 def without(rows: Rows, dropped: Array) -> Rows:
@@ -169,8 +158,7 @@ def _rounds(
         fastest = jnp.maximum(fastest, speed.max((0, 1, 2)))
     # What the solver leaves of the first approach is no second one.
     least = lax.stop_gradient(float(jnp.finfo(before.dtype).eps) ** 0.5 * fastest)
-    restitution = pair_restitution(model)
-    bounce = [pack_scalars(group.rows.table, [select(group.rows.table, restitution)], worlds) for group in groups]
+    bounce = [_restitution(model, group.rows, worlds) for group in groups]
     iterations = 4 * scene.options.velocity_iterations
 
     def solve(state: tuple[Array, Impulses]) -> tuple[Array, Impulses]:
@@ -244,15 +232,12 @@ def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, f
 def _approach(rows: Rows, velocity: Array) -> Array:
     """(turn, 1, column, world) speed at which each contact approaches; 0 where there is none."""
     speed = -pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
-    return jnp.where(_acts(rows), jnp.maximum(speed, 0.0), 0.0)
+    return jnp.where(contact.normal_mass(rows) > 0, jnp.maximum(speed, 0.0), 0.0)
 
 
 def _leaves(model: Model, group: ContactRows, pull: Array, e: Array, speed: Array, velocity: Array) -> Array:
     """Whether the bodies of a contact leave each other after the impact, or rest."""
-    rows = group.rows
-    sides = [jnp.abs(side) for side in rows.jacobian]
-    scale = pgs.first_row_velocity(rows.table, sides, rows.places, jnp.abs(velocity))
-    rests = rest_speed(pull, model.dt, group.size, scale)
+    rests = rest_speed(pull, model.dt, group.size, _speeds(group.rows, velocity))
     return settle(jnp.where(-e * speed > rests, 1.0, 0.0)) > 0.5
 
 
@@ -271,11 +256,7 @@ def _touch(model: Model, bodies: Bodies, contacts: ContactSet, pull: Array) -> A
         velocities.append((body.velocity + turned) * moves.astype(contacts.separation.dtype))
     speed = jnp.abs(dot(contacts.normal, velocities[1] - velocities[0]))
     scale = norm(velocities[0]) + norm(velocities[1])
-    sizes = [
-        jnp.where(np.asarray(scene.static)[np.asarray(side)][:, None], jnp.inf, take(model.size, np.asarray(side)))
-        for side in sides
-    ]
-    size = jnp.minimum(*sizes)
+    size = smaller_moving(model, *sides)
     rests = speed <= rest_speed(pull, model.dt, size, scale)
     gap = contacts.separation
     meets = gap <= 4.0 * float(jnp.finfo(gap.dtype).eps) ** 0.5 * size

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.bodies import InverseInertia, pack_blocks
+from mathota_jax.bodies import InverseInertia, pack_blocks, smaller_moving
 from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
     Side,
@@ -127,11 +127,8 @@ def pack_motion(scene: Scene, linear: Vec3, angular: Vec3) -> Array:
 
 def near_contacts(scene: Scene, model: Model, contacts: ContactSet) -> ContactSet:
     """The contacts without those so far ahead that they are left to the search along the motion (`SPECULATIVE`)."""
-    sizes = [
-        jnp.where(np.asarray(scene.static)[np.asarray(side)][:, None], jnp.inf, take(model.size, side))
-        for side in scene.slot_bodies
-    ]
-    near = settle(jnp.where(contacts.separation <= SPECULATIVE * jnp.minimum(*sizes), 1.0, 0.0)) > 0.5
+    reach = SPECULATIVE * smaller_moving(model, *scene.slot_bodies)
+    near = settle(jnp.where(contacts.separation <= reach, 1.0, 0.0)) > 0.5
     return contacts._replace(active=contacts.active & near)
 
 
@@ -166,7 +163,7 @@ def contact_rows(
             for velocity in (motion.velocity, motion.free_velocity)
         )
     )
-    restitution = _pair_restitution(scene, table, model, pairs) if scene.restitution else None
+    restitution = pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
     if scene.options.solver == "soft_step":
         target, lever = rebound(approach, model.dt, model.dt * (1.0 + 1.0 / scene.options.substep_count))
@@ -174,17 +171,17 @@ def contact_rows(
         target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     # Empty columns of a table have no response.
-    normal_mass = safe_divide(active, _row_bound(table, jacobians, responses, active, (0,)))
+    mass = safe_divide(active, _row_bound(table, jacobians, responses, active, (0,)))
     bias = [-target]
     if scene.friction:
         law = Cone(
-            normal_mass=normal_mass,
+            normal_mass=mass,
             tangent_mass=safe_divide(active, _row_bound(table, jacobians, responses, active, (1, 2))),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
-        law = _push_only(normal_mass[:, None])
+        law = _push_only(mass[:, None])
     rows = Rows(
         jacobian=tuple(jacobians),
         response=tuple(responses),
@@ -324,10 +321,15 @@ def _pair_friction(scene: Scene, table: Table | TracedTable, model: Model, pairs
     return safe_sqrt(a * b)
 
 
-def _pair_restitution(scene: Scene, table: Table | TracedTable, model: Model, pairs: PlacedPairs | None) -> Array:
-    """Smaller of the two coefficients (guide 8.2)."""
+def pair_restitution(scene: Scene, table: Table | TracedTable, model: Model, pairs: PlacedPairs | None) -> Array:
+    """Smaller of the two coefficients (guide 8.2), (turn * column, world)."""
     a, b = _of_bodies(scene, table, pairs, model.restitution)
     return jnp.minimum(a, b)
+
+
+def normal_mass(rows: Rows) -> Array:
+    """(turn, 1, column, world) effective mass of each contact along its normal; 0 where there is none."""
+    return rows.law.normal_mass[:, None] if isinstance(rows.law, Cone) else rows.law.effective_mass
 
 
 def position_rows(contact: ContactRows, displacement: Array, percent: float) -> Rows:
@@ -344,7 +346,7 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
     error = (
         jnp.maximum(contact.separation + displacement, jnp.minimum(contact.separation, -contact.size)) + contact.slop
     )
-    mass = rows.law.normal_mass[:, None] if isinstance(rows.law, Cone) else rows.law.effective_mass
+    mass = normal_mass(rows)
     return Rows(
         jacobian=tuple(side[:, :1] for side in rows.jacobian),
         response=tuple(side[:, :1] for side in rows.response),

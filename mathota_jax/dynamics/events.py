@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.bodies import Bodies
+from mathota_jax.bodies import Bodies, smaller_moving
 from mathota_jax.collision.narrowphase import SPECULATIVE
-from mathota_jax.dynamics.pair_motion import contacts_between, reaches, smaller_moving, turning
+from mathota_jax.dynamics.pair_motion import contacts_between, reaches, turning
 from mathota_jax.model import Model
 from mathota_jax.scene import PairGroup
 from mathota_jax.spatial.indexing import take, unstack
@@ -126,7 +126,9 @@ def _pairs(model: Model, group: PairGroup, motion: Motion) -> _Pairs:
     sides = (group.bodies_a, group.bodies_b)
     a, b = (take(motion, side) for side in sides)
     sizes = [take(model.size, side) for side in sides]
-    return _Pairs(a, b, reaches(model, group), smaller_moving(model, group), jnp.minimum(*sizes))
+    return _Pairs(
+        a, b, reaches(model, group), smaller_moving(model, group.bodies_a, group.bodies_b), jnp.minimum(*sizes)
+    )
 
 
 def _fast(pairs: _Pairs) -> Array:

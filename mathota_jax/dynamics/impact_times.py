@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.bodies import smaller_moving
 from mathota_jax.collision.narrowphase import find_contacts
-from mathota_jax.collision.rest import TOUCHING, rest_speed
+from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
 from mathota_jax.dynamics.flight import Flight
-from mathota_jax.dynamics.pair_motion import contacts_between, reaches, smaller_moving, turning
+from mathota_jax.dynamics.pair_motion import contacts_between, reaches, turning
 from mathota_jax.model import Model
 from mathota_jax.scene import PairGroup
 from mathota_jax.spatial.indexing import take, unstack
@@ -102,7 +103,7 @@ def _search(
     count = len(group.bodies_a)
     a, b = (take(flight, side) for side in (group.bodies_a, group.bodies_b))
     reach_a, reach_b = reaches(model, group)
-    size = smaller_moving(model, group)
+    size = smaller_moving(model, group.bodies_a, group.bodies_b)
     near = tolerance(size.dtype) * size
     restitution = jnp.minimum(*(take(model.restitution, side) for side in (group.bodies_a, group.bodies_b)))
     rebound = jnp.where(restitution > 0, restitution, 1.0)
@@ -138,7 +139,7 @@ def _search(
         level = jnp.where(first, overlap, level)
         for counts, separation, rate, bend in seen:
             gap = separation - level
-            step = jnp.minimum(step, jnp.where(counts, _next_touch(gap, rate, bend, near), jnp.inf))
+            step = jnp.minimum(step, jnp.where(counts, next_touch(gap, rate, bend, near)[0], jnp.inf))
             deeper = counts & (gap < deepest)
             deepest, rate_there = jnp.where(deeper, gap, deepest), jnp.where(deeper, rate, rate_there)
             impact = impact | (counts & (gap <= near) & (rate < 0))
@@ -171,18 +172,6 @@ def _search(
     last = lax.while_loop(lambda s: s.going.any() & (s.count < ADVANCES), advance, start)
     # What is not decided by then is stopped where nothing was overstepped yet, and looked at again from there.
     return jnp.where(last.going, last.low, last.time), last.touches | last.going
-
-
-def _next_touch(gap: Array, rate: Array, bend: Array, near: Array) -> Array:
-    """First time after now at which ``gap + rate t + bend t^2 / 2`` is 0, or is so again for a point that leaves now."""
-    gap = jnp.where((gap <= near) & (rate > 0), 0.0, jnp.maximum(gap, 0.0))
-    discriminant = rate * rate - 2.0 * bend * gap
-    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
-    divisor = root - rate
-    down = jnp.where(divisor > 0, 2.0 * gap / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
-    falls = bend < 0
-    up = jnp.where(falls, (rate + root) / jnp.where(falls, -bend, 1.0), jnp.inf)
-    return jnp.where(discriminant < 0, jnp.inf, jnp.where(rate > 0, up, down))
 
 
 def _by_point(values: Array, count: int, shape: tuple[int, int]) -> list[Array]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from mathota_jax.collision.narrowphase import ContactSet, group_contacts
@@ -41,15 +40,6 @@ def reaches(model: Model, group: PairGroup) -> tuple[Array, Array]:
         # A sphere about its centre of mass turns in itself.
         found.append(offset if kind == "sphere" else radius + offset)
     return found[0], found[1]
-
-
-def smaller_moving(model: Model, group: PairGroup) -> Array:
-    """(pair or 1, world) inner radius of the smaller moving body of each pair."""
-    sizes = [
-        jnp.where(np.asarray([model.scene.static[body] for body in side])[:, None], jnp.inf, take(model.size, side))
-        for side in (group.bodies_a, group.bodies_b)
-    ]
-    return jnp.minimum(*sizes)
 
 
 def turning(turn: Array, reach: Array) -> Array:

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import store
 
 GROUND = -1
@@ -118,7 +119,7 @@ def force_for(tree: Tree, factors: Factors, jump: Pair) -> Pair:
       jump: motion of each link relative to its parent, but for any sum of its columns.
     """
     worlds = max(jump[0].shape[-1], factors.offset.shape[-1])
-    jump = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), jump)
+    jump = in_every_world(jump, worlds)
     columns = (factors.columns, factors.forces, factors.compliance)
 
     def gather(force: Pair, link: tuple) -> tuple[Pair, tuple]:

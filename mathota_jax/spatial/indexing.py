@@ -72,3 +72,8 @@ def unstack(array: Array, axis: int) -> list[Array]:
     """
     parts = jax.lax.split(array, (1,) * array.shape[axis], axis=axis % array.ndim)
     return [jnp.squeeze(part, axis) for part in parts]
+
+
+def in_every_world(tree: Any, worlds: int) -> Any:
+    """Arrays (..., world or 1) of a pytree with as many worlds as given."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), tree)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import SceneBuilder, Sphere, rollout
+from mathota_jax import Sphere, rollout
 from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, G
+from tests.physics.test_billiards import two_balls
 from tests.scenes import body_on_plane, undamped
 
 OBLIQUE = {"y": 0.0, "vx": 2.0, "vy": 0.0, "radius": 0.2, "restitution": 0.9, "m1": 1.0, "m2": 2.0}
@@ -25,14 +26,6 @@ BY_Y2 = {
 """Slopes of the height of the second ball after 1 s (benchmark C5)."""
 BY_X2 = {"y": 2.406057, "vx": 0.475, "vy": 0.970908, "radius": 3.228782, "m1": 0.426363}
 BY_Y1 = {"y": 3.144943, "vy": 1.487775, "radius": 1.194943}
-
-
-def two_balls():
-    builder = SceneBuilder(gravity=(0, 0, 0))
-    surface = {"restitution": 0.9, "friction": 0.0}
-    builder.add_body(Sphere(0.2), mass=1.0, velocity=(2.0, 0.0, 0.0), **surface)
-    builder.add_body(Sphere(0.2), mass=2.0, position=(1.0, 0.2, 0.0), **surface)
-    return builder.build(undamped(impact_events=1))
 
 
 @functools.partial(jax.jit, static_argnames="count")
