@@ -11,9 +11,10 @@ expected impulse per time, with v the speed of approach and m the reduced mass, 
 
     F(gap) = (1 + restitution) m v^2 w(gap / reach) / reach,    w(s) = s^2 exp(-s) / 2,
 
-so that all of the approach together passes on one impulse. Its derivative by the gap is added to that of the step, while
-the force itself is not. The density vanishes at the surface: over an approach that ends in a head-on impact the added
-derivatives cancel and leave the exact one.
+so that all of the approach together passes on one impulse. A share of its derivative by the gap is added to that of the
+step, the force itself is not. The density vanishes at the surface, so that over an approach that ends in a head-on impact
+the added velocities cancel; the places that they have moved until then do not: a real impact's derivatives are biased by
+the same share.
 """
 
 from __future__ import annotations
@@ -32,31 +33,37 @@ from mathota_jax.state import State
 from mathota_jax.step import step
 
 
-def smoothed_step(model: Model, state: State, action: Array | None = None, *, reach: float) -> State:
+def smoothed_step(
+    model: Model, state: State, action: Array | None = None, *, reach: float, strength: float = 0.1
+) -> State:
     """`step`, bitwise, whose derivatives feel contacts from a distance of about `reach`.
 
     Arguments, result and errors as for `step`; to be used with `long_rollout` as
     ``stepper=functools.partial(smoothed_step, reach=0.1)``. Both modes of differentiation work.
 
-    What is added to the exact derivatives is that of the force in the module's description by the gap, normal to the
-    surfaces; speeds and masses count as constants. Where bodies meet head-on the sum over the approach vanishes, if a step
-    is short against the reach; where they meet at an angle it does not: there the derivatives are biased. Pairs that part,
-    rest or overlap add nothing. A broadphase (`Options.broadphase`) finds no pair that is further apart than its margin.
+    What is added to the exact derivatives is `strength` times that of the expected force by the gap, normal to the surfaces
+    (see the module); speeds and masses count as constants. Where bodies really meet, the derivatives are biased in
+    proportion: by about half the strength for a ball after a head-on impact, whatever the reach. Pairs that
+    part, rest or overlap add nothing. A broadphase (`Options.broadphase`) finds no pair that is further apart than its
+    margin.
 
     Args:
       model: parameters and static scene.
       state: state of one world.
       action: (motor,) as for `step`.
-      reach: [m], positive. The derivative peaks at 3.4 times this gap and is 5 % of that at 9 times.
+      reach: [m], positive. What pulls bodies together peaks at a gap of 3.4 times this and is 5 % of that at 9 times.
+      strength: positive share of an impact that is felt: how loud a miss is beside the exact derivatives.
 
     Raises:
-      ValueError: as `step`, or a reach that is not positive.
+      ValueError: as `step`, or a reach or strength that is not positive.
     """
     if not reach > 0:
         raise ValueError(f"smoothed_step: reach must be a positive length [m], got {reach!r}")
+    if not strength > 0:
+        raise ValueError(f"smoothed_step: strength must be positive, got {strength!r}")
     if not model.scene.slot_count:
         return step(model, state, action)
-    force, torque = jax.checkpoint(lambda model, state: _expected_forces(model, state, reach))(model, state)
+    force, torque = jax.checkpoint(lambda model, state: _expected_forces(model, state, reach, strength))(model, state)
     felt = dataclasses.replace(
         state,
         applied_force=state.applied_force + _tangent_only(force),
@@ -76,17 +83,21 @@ def _tangent_only_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
     return jnp.zeros_like(primals[0]), tangents[0]
 
 
-def _expected_forces(model: Model, state: State, reach: float) -> tuple[Array, Array]:
+def _expected_forces(model: Model, state: State, reach: float, share: float) -> tuple[Array, Array]:
     """Forces and torques (body, 3) by which the bodies of every pair would feel each other from afar."""
-    scene, found = model.scene, contacts(model, state)
-    fixed, held = lax.stop_gradient((found, state))
+    scene = model.scene
+    held, constants = lax.stop_gradient((state, model))
+    # The gap depends on poses and shapes alone, and nothing else is differentiated.
+    placed = dataclasses.replace(held, position=state.position, orientation=state.orientation)
+    found = contacts(dataclasses.replace(constants, shapes=model.shapes), placed)
+    fixed = lax.stop_gradient(found)
     sides = (fixed.body_a, fixed.body_b)
     arms = [fixed.position - held.position[body] for body in sides]
     speeds = [
         held.velocity[body] + jnp.cross(held.angular_velocity[body], arm) for body, arm in zip(sides, arms, strict=True)
     ]
     approach = jnp.maximum(-jnp.sum(fixed.normal * (speeds[1] - speeds[0]), axis=-1), 0.0)
-    strength = lax.stop_gradient(_stopping_mass(model, fixed)) * approach**2 / reach
+    strength = share * _stopping_mass(constants, fixed) * approach**2 / reach
     depth = jnp.where(found.active, jnp.maximum(found.separation, 0.0), 0.0) / reach
     force = (strength * 0.5 * depth**2 * jnp.exp(-depth))[:, None] * fixed.normal
     total, torque = jnp.zeros_like(state.velocity), jnp.zeros_like(state.velocity)

@@ -86,7 +86,7 @@ def long_rollout(
 
     whole = count // segment * segment
     indexed = (jnp.arange(count), actions)
-    parts = jax.tree.map(lambda x: x[:whole].reshape(-1, segment, *x.shape[1:]), indexed)
+    parts = jax.tree.map(lambda x: x[:whole].reshape(count // segment, segment, *x.shape[1:]), indexed)
     state, seen = lax.scan(lambda state, part: steps(model, state, part), state, parts)
     seen = jax.tree.map(lambda x: x.reshape(whole, *x.shape[2:]), seen)
     if whole < count:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Plane, SceneBuilder, Sphere, step
+from mathota_jax import Plane, SceneBuilder, Sphere, step
 from mathota_jax.gradients import long_rollout, smoothed_step
 from tests.scenes import undamped
 
@@ -49,7 +49,7 @@ def test_a_miss_has_a_useful_gradient(precision):
         value, slope = target_speed(height, model, state, 0.05)
         assert np.isfinite(slope)
         values.append(float(value))
-        height = height + 0.02 * slope / jnp.maximum(jnp.abs(slope), 1.0)
+        height = height + 0.02 * slope / jnp.maximum(jnp.abs(slope), 0.1)
     assert values[0] == 0.0
     assert values[-1] == pytest.approx((1 + RESTITUTION) * SPEED / 4, rel=0.05)
 
@@ -67,14 +67,14 @@ def test_values_are_those_of_the_step_bitwise(precision, height):
 
 
 def test_derivative_of_a_single_step(float64, gate):
-    """What one step adds is exactly that of the force (1 + e) m v^2 w(gap / reach) / reach on both bodies."""
+    """What one step adds is exactly a tenth of the force (1 + e) m v^2 w(gap / reach) / reach on both bodies."""
     model, state = ball_and_target(0.0)
     reach = 0.3
     speeds = jax.jit(jax.jacfwd(lambda x: moved(x, model, state, reach)))(-1.0)
     gap = (1.0 - 2 * RADIUS) / reach
     mass = 1.0 * 3.0 / 4.0
     slope = (gap - gap**2 / 2) * np.exp(-gap) / reach  # d w / d gap; the gap shrinks as x grows
-    by_place = -(1 + RESTITUTION) * mass * SPEED**2 / reach * slope
+    by_place = -0.1 * (1 + RESTITUTION) * mass * SPEED**2 / reach * slope
     gate("d v1 / d x", speeds[0] + by_place / 1.0 * DT, 1e-12)
     gate("d v2 / d x", speeds[1] - by_place / 3.0 * DT, 1e-12)
 
@@ -84,37 +84,40 @@ def moved(x, model, state, reach):
     return smoothed_step(model, start, reach=reach).velocity[:, 0]
 
 
-def test_a_head_on_hit_keeps_its_exact_derivative(float64, gate):
-    """What the approach adds cancels: the place of the ball after the impact still moves by the closed form."""
-    model, state = ball_and_target(0.0)
-
-    @jax.jit
-    @functools.partial(jax.jacfwd)
-    def slopes(start):
+@functools.partial(jax.jit, static_argnames="stepper")
+def head_on_slopes(start, model, state, stepper):
+    def end(start):
         moving = dataclasses.replace(
             state,
             position=state.position.at[0, 0].set(start["x"]),
             velocity=state.velocity.at[0, 0].set(start["v"]),
         )
-        stepper = functools.partial(smoothed_step, reach=0.1)
         final = long_rollout(model, moving, 90, stepper=stepper)[0]
-        return final.position[0, 0], final.velocity[0, 0]
+        return jnp.stack([final.position[0, 0], final.velocity[0, 0]])
 
-    place, speed = slopes({"x": jnp.asarray(-1.0), "v": jnp.asarray(SPEED)})
-    # v1' = c v with c = (m1 - e m2) / (m1 + m2); x1' = x_hit + c v (T - (x_hit - x) / v).
-    c, hit, time = (1.0 - RESTITUTION * 3.0) / 4.0, -2 * RADIUS, 0.75
-    gate("d x / d x", place["x"] - c, 2e-2)
-    gate("d x / d v", place["v"] - c * time, 2e-2)
-    gate("d v / d x", speed["x"], 2e-2)
-    gate("d v / d v", speed["v"] - c, 2e-2)
-    assert hit < 0
+    return jax.jacfwd(end)(start)
+
+
+def test_the_bias_of_a_hit_is_in_proportion_to_the_strength(float64, gate):
+    """v1' = c v with c = (m1 - e m2) / (m1 + m2), and x1' = x_hit + c (v T - (x_hit - x))."""
+    model, state = ball_and_target(0.0)
+    c = (1.0 - RESTITUTION * 3.0) / 4.0
+    truth = {"x": np.array([c, 0.0]), "v": np.array([c * 0.75, c])}
+    start = {"x": jnp.asarray(-1.0), "v": jnp.asarray(SPEED)}
+    bias = {}
+    for strength in (0.01, 0.1):
+        stepper = functools.partial(smoothed_step, reach=0.1, strength=strength)
+        slopes = head_on_slopes(start, model, state, stepper)
+        bias[strength] = np.concatenate([slopes[name] - truth[name] for name in truth])
+        gate(f"strength {strength}: bias / strength", bias[strength] / strength, 1.0)
+    assert np.abs(bias[0.1]).max() > 5 * np.abs(bias[0.01]).max()
 
 
 def test_nothing_is_added_at_rest_or_without_contacts(float64):
-    """A box that stands has the derivatives of `step`; and in a scene without pairs the step itself is traced."""
+    """A ball at rest has the derivatives of `step`; and in a scene without pairs the step itself is traced."""
     builder = SceneBuilder(gravity=(0, -9.81, 0))
     builder.add_body(Plane((0, 1, 0)), static=True)
-    builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(0, 0.1, 0))
+    builder.add_body(Sphere(0.1), mass=1.0, position=(0, 0.1, 0))
     model, state = builder.build(undamped(dt=DT))
 
     @functools.partial(jax.jit, static_argnames="stepper")
@@ -135,7 +138,9 @@ def test_nothing_is_added_at_rest_or_without_contacts(float64):
     )
 
 
-def test_bad_reach():
+def test_bad_reach_and_strength():
     model, state = ball_and_target(0.0)
+    with pytest.raises(ValueError, match="strength must be positive"):
+        smoothed_step(model, state, reach=0.1, strength=0.0)
     with pytest.raises(ValueError, match="reach must be a positive length"):
         smoothed_step(model, state, reach=0.0)
