@@ -174,8 +174,9 @@ class ShortHorizonActorCritic:
         )
         done = steps.terminated | steps.truncated
         finished = done.sum().astype(jnp.float32)
+        norm = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
         returns = jnp.sum(jnp.where(done, steps.episode_return, 0.0))
-        return new, UpdateMetrics(finished, returns, loss, critic_loss, optax.global_norm(gradient))
+        return new, UpdateMetrics(finished, returns, loss, critic_loss, norm)
 
     def actor_loss(
         self, actor: Parameters, state: TrainingState, key: Array
@@ -219,7 +220,9 @@ class ShortHorizonActorCritic:
             observation, target = minibatch
             return jnp.mean((state_value(critic, observation) - target) ** 2)
 
-        def descend(carry: tuple[Parameters, Any], minibatch: tuple[Array, Array]) -> tuple[tuple[Parameters, Any], Any]:
+        def descend(
+            carry: tuple[Parameters, Any], minibatch: tuple[Array, Array]
+        ) -> tuple[tuple[Parameters, Any], Any]:
             critic, optimizer = carry
             loss, gradient = jax.value_and_grad(error)(critic, minibatch)
             change, optimizer = self.critic_optimizer.update(gradient, optimizer, critic)

@@ -74,7 +74,9 @@ class ShortHorizonHyperparameters:
 
 
 SHORT_HORIZON_PRESETS: dict[str, ShortHorizonHyperparameters] = {
-    "mathota/InvertedPendulum-v0": ShortHorizonHyperparameters(worlds=20, steps=200_000, discount=0.99, evaluations=100),
+    "mathota/InvertedPendulum-v0": ShortHorizonHyperparameters(
+        worlds=20, steps=200_000, discount=0.99, evaluations=100
+    ),
     "mathota/BallBalance-v0": ShortHorizonHyperparameters(steps=300_000),
 }
 

@@ -15,6 +15,6 @@ __all__ = [
     "first_order",
     "long_rollout",
     "mixed_order",
-    #    "smoothed_step",
+    "smoothed_step",
     "zeroth_order",
 ]

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
 Loss = Callable[[Any], Array]
@@ -86,7 +87,11 @@ def mixed_order(
     interval. So the estimate is right in the limit of many samples also where the loss jumps.
 
     Args:
-      loss, parameters, key, deviation, pairs: as for `first_order`.
+      loss: as for `first_order`.
+      parameters: likewise.
+      key: likewise.
+      deviation: likewise.
+      pairs: likewise.
       tolerance: bias allowed, in standard errors of the zeroth order.
 
     Raises:
@@ -121,7 +126,7 @@ def _perturbations(
         spread = ravel_pytree(jax.tree.map(lambda s, p: jnp.broadcast_to(s, jnp.shape(p)), deviation, parameters))[0]
     else:
         spread = jnp.broadcast_to(jnp.asarray(deviation), flat.shape)
-    if not isinstance(spread, jax.core.Tracer) and not bool((spread > 0).all()):
+    if not isinstance(spread, Tracer) and not bool((spread > 0).all()):
         raise ValueError(f"{name}: every deviation must be positive, got {deviation!r}")
     return flat, unravel, spread.astype(flat.dtype), jax.random.normal(key, (pairs, flat.size), flat.dtype)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import pathlib
 import zlib
@@ -91,7 +92,9 @@ def parameters_of(pair: tuple[str, str]) -> tuple[list[str], Callable[[Any, Any]
     labels = [f"{what} {side}" for side in "AB" for what in ("position", "orientation") for _ in range(3)]
     for side, geometry in zip("AB", (a, b), strict=True):
         # ravel_pytree takes the leaves in the order of their names.
-        labels += [f"{name} {side}" for name in sorted(geometry.parameters) for _ in range(geometry.parameters[name].size)]
+        labels += [
+            f"{name} {side}" for name in sorted(geometry.parameters) for _ in range(geometry.parameters[name].size)
+        ]
 
     def outputs(vector: Any, pose: Any) -> Any:
         by_a, by_b = unravel(vector[12:])
@@ -126,7 +129,7 @@ def differences(outputs: Any, start: np.ndarray, poses: np.ndarray) -> tuple[np.
         near, far = values[:, :, 0] - values[:, :, 1], values[:, :, 2] - values[:, :, 3]
         found.append((8 * near - far) / (12 * length))
     scale = np.maximum(1.0, np.abs(found[-1]))
-    gaps = np.stack([np.abs(b - a) / scale for a, b in zip(found, found[1:], strict=False)])
+    gaps = np.stack([np.abs(b - a) / scale for a, b in itertools.pairwise(found)])
     best = gaps.argmin(0)
     chosen = np.where(best == 0, found[1], found[2])
     return chosen, gaps.min(0) <= AGREEMENT
@@ -184,11 +187,11 @@ def table(rows: list[dict]) -> str:
     lines = [
         "# Derivatives of the distance of two shapes",
         "",
-        "Written by `python -m tests.benchmarks.pair_derivatives`: `signed_distance` of random poses, apart and overlapping,",
-        "differentiated by poses (rotation vector of the orientation) and all sizes, against central differences of fourth",
-        f"order in float64. Errors are absolute where a derivative is below 1 and relative above; gate {GATE:g}. Left out are",
-        f"poses in which differences of two lengths disagree by more than {AGREEMENT:g}: there a feature (face, edge, corner)",
-        "changes within the difference. *Kept* counts the others.",
+        "Written by `python -m tests.benchmarks.pair_derivatives`: `signed_distance` of random poses, apart and",
+        "overlapping, differentiated by poses (rotation vector of the orientation) and all sizes, against central",
+        "differences of fourth order in float64. Errors are absolute where a derivative is below 1 and relative above; gate",
+        f"{GATE:g}. Left out are poses in which differences of two lengths disagree by more than {AGREEMENT:g}: there a",
+        "feature (face, edge, corner) changes within the difference. *Kept* counts the others.",
         "",
         "## By pair",
         "",
@@ -199,7 +202,12 @@ def table(rows: list[dict]) -> str:
         chosen = [row for row in rows if row["pair"] == pair]
         lines.append(_line(pair, chosen))
     lines.append(_line("all", rows))
-    lines += ["", "## By pair and parameter", "", "| Pair | parameter | kept | separation | normal | point A | point B |"]
+    lines += [
+        "",
+        "## By pair and parameter",
+        "",
+        "| Pair | parameter | kept | separation | normal | point A | point B |",
+    ]
     lines += ["|---|---|---|---|---|---|---|"]
     for row in rows:
         cells = [f"{row['kept']} of {row['poses']}", *(f"{row[name]:.0e}" for name in OUTPUTS)]

@@ -1,4 +1,4 @@
-"""The closed-form gradients once more (C1, C6, C9, C11), with a resting contact and a pair that never touches beside them."""
+"""The closed-form gradients once more (C1, C6, C9, C11), beside a resting contact and a pair that never touches."""
 
 import dataclasses
 
@@ -47,9 +47,7 @@ def bounce(height, velocity, restitution, gravity, time):
 def test_one_bounce(precision, gate):
     value, slopes = bounce(1.0, -2.0, 1.0, 0.0, 1.0)
     gate("C1a: height / truth - 1", value / 1.2 - 1, 1e-3)
-    check(
-        gate, slopes, {"height": -1.0, "velocity": -1.0, "restitution": 1.1, "radius": 2.0}, LIMIT[str(precision)]
-    )
+    check(gate, slopes, {"height": -1.0, "velocity": -1.0, "restitution": 1.1, "radius": 2.0}, LIMIT[str(precision)])
     value, slopes = bounce(1.0, 0.0, 0.8, G, 0.8)
     gate("C1b: height / truth - 1", value / 0.671884928 - 1, 1e-3)
     check(gate, slopes, UNDER_GRAVITY, LIMIT[str(precision)])

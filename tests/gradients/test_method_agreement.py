@@ -33,7 +33,8 @@ def test_unrolled_sweeps_have_the_implicit_derivative(float64, friction, gate):
         return pgs.solve(20000, 20000, rows, velocity, start)[0]
 
     (_, truth), (_, few), (_, many) = (
-        jax.jit(lambda v, f=f: jax.jvp(f, (v,), (direction,)))(packed) for f in (implicit, unrolled(50), unrolled(20000))
+        jax.jit(lambda v, f=f: jax.jvp(f, (v,), (direction,)))(packed)
+        for f in (implicit, unrolled(50), unrolled(20000))
     )
     gate("20000 sweeps: unrolled - implicit", many - truth, 1e-9)
     assert np.abs(few - truth).max() > 1e-6  # 50 sweeps are not enough: the comparison can fail
