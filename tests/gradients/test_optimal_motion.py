@@ -15,6 +15,7 @@ from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import undamped
 
 LIMIT = {"float32": 1e-2, "float64": 1e-3}
+PRECISIONS = pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 
 
 # ---- C2: ground, then wall ---------------------------------------------------------------------------------------
@@ -54,6 +55,7 @@ def best_throw(velocity, model, state, count, iterations):
     return jax.lax.scan(descend, velocity, None, length=iterations)
 
 
+@PRECISIONS
 def test_slope_of_a_throw(precision, gate):
     model, state = ground_and_wall()
     loss, slope = throw(jnp.array([5.0, -5.0]), model, state, 288)
@@ -61,7 +63,7 @@ def test_slope_of_a_throw(precision, gate):
     gate("C2: slope / truth - 1", slope / np.array([-3.166272, -0.587328]) - 1, LIMIT[str(precision)])
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@PRECISIONS
 def test_best_throw(precision, gate):
     """Steepest descent through two impacts; schemes without the time of impact walk away from the wall."""
     model, state = ground_and_wall()
@@ -123,6 +125,7 @@ def start():
     return {**{name: jnp.asarray(value) for name, value in pairs.items()}, "force": jnp.full((STEPS, 2), 3.0)}
 
 
+@PRECISIONS
 def test_slopes_of_a_driven_collision(precision, gate):
     model, state = two_balls()
     value, slopes = end_slopes(start(), model, state)
@@ -136,7 +139,7 @@ def test_slopes_of_a_driven_collision(precision, gate):
     assert not by_force[332:].any()
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@PRECISIONS
 def test_optimal_control(precision, gate):
     """960 forces by a quasi-Newton method; without the time of impact the loss sticks at 2.0, the optimum is 1.3965."""
     model, state = two_balls()
