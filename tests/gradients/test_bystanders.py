@@ -53,7 +53,7 @@ def test_one_bounce(precision, gate):
     check(gate, slopes, UNDER_GRAVITY, LIMIT[str(precision)])
 
 
-@PRECISIONS
+@pytest.mark.slow  # boxes in reverse mode compile for half a minute
 def test_slide_to_rest(precision, gate):
     speed, friction = 2.0, 0.4
     model, state = crowded(Box((0.2, 0.05, 0.2)), friction=friction, position=(0.0, 0.05, 0.0))
@@ -67,7 +67,7 @@ def test_slide_to_rest(precision, gate):
     gate("C6: d x / d mass", slopes["mass"], {"float32": 1e-5, "float64": 1e-6}[str(precision)])
 
 
-@PRECISIONS
+@pytest.mark.slow
 def test_stick_and_slip(precision, gate):
     model, state = crowded(Box((0.2, 0.05, 0.2)), friction=0.4, position=(0.0, 0.05, 0.0), dt=1 / COUNT)
     factors = np.array([0.5, 0.99, 1.0, 1.01, 6.0 / THRESHOLD])
@@ -76,8 +76,8 @@ def test_stick_and_slip(precision, gate):
     assert np.isfinite(by_force).all() and np.isfinite(by_friction).all()
     sticks, slips = factors < 1, factors > 1
     gate("C11 sticking: dv/dF", by_force[sticks], 1e-3)
-    gate("C11 slipping: dv/dF - 1", by_force[slips] - 1.0, 5e-3)
-    gate("C11 slipping: dv/dmu / truth - 1", by_friction[slips] / -GRAVITY - 1.0, 5e-3)
+    gate("C11 slipping: dv/dF - 1", by_force[slips] - 1.0, LIMIT[str(precision)])
+    gate("C11 slipping: dv/dmu / truth - 1", by_friction[slips] / -GRAVITY - 1.0, LIMIT[str(precision)])
     gate("C11: v - 2.076 m/s", velocity[-1] - 2.076, 1e-2)
 
 
