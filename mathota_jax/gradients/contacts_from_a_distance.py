@@ -43,9 +43,8 @@ def smoothed_step(
 
     What is added to the exact derivatives is `strength` times that of the expected force by the gap, normal to the surfaces
     (see the module); speeds and masses count as constants. Where bodies really meet, the derivatives are biased in
-    proportion: by about half the strength for a ball after a head-on impact, whatever the reach. Pairs that
-    part, rest or overlap add nothing. A broadphase (`Options.broadphase`) finds no pair that is further apart than its
-    margin.
+    proportion: by about half the strength for a ball after a head-on impact. Pairs that part, rest or overlap add nothing.
+    A broadphase (`Options.broadphase`) finds no pair that is further apart than its margin.
 
     Args:
       model: parameters and static scene.

@@ -83,8 +83,7 @@ def mixed_order(
 
     The share of the first order is that of least variance, ``s0^2 / (s0^2 + s1^2)``, but never so large that the two
     estimates, should they differ because the first order is wrong, pull the result by more than `tolerance` standard
-    errors of the zeroth order away from it: the bound on the bias that Suh et al. (equation 10) take from a confidence
-    interval. So the estimate is right in the limit of many samples also where the loss jumps.
+    errors of the zeroth order away from it (Suh et al. bound the bias by a confidence interval in the same way). So the estimate is right in the limit of many samples also where the loss jumps.
 
     Args:
       loss: as for `first_order`.
