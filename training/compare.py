@@ -76,7 +76,7 @@ def save_comparison(path: Path, runs: Sequence[dict[str, Any]]) -> None:
         low, high = ([m + sign * d for m, d in zip(mean, deviation, strict=True)] for sign in (-1, 1))
         axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.set(title=runs[0]["environment"], xlabel="world-steps", ylabel="return of an episode, evaluated")
-    axes.set_xlim(left=0)
+    axes.set_xlim(0, min(run["steps"] for run in runs))  # equal steps for all
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small")

@@ -83,7 +83,8 @@ def mixed_order(
 
     The share of the first order is that of least variance, ``s0^2 / (s0^2 + s1^2)``, but never so large that the two
     estimates, should they differ because the first order is wrong, pull the result by more than `tolerance` standard
-    errors of the zeroth order away from it (Suh et al. bound the bias by a confidence interval in the same way). So the estimate is right in the limit of many samples also where the loss jumps.
+    errors of the zeroth order away from it (Suh et al. bound the bias by a confidence interval in the same way). So the
+    estimate is right in the limit of many samples also where the loss jumps.
 
     Args:
       loss: as for `first_order`.
