@@ -1,8 +1,8 @@
 """Cost and memory of reverse mode: a slab that slides, a stack of five boxes, a chain of five links.
 
-    OMP_NUM_THREADS=1 python -m tests.benchmarks.gradient_cost [--scenes slide,stack,chain]
+    OMP_NUM_THREADS=1 python -m tests.benchmarks.gradient_cost [--scenes slide,stack,chain] [--only memory]
 
-Writes ``results/gradient_cost.md``: CPU time of value and gradient over that of the value, worlds side by side, interleaved
+Writes ``results/gradient_cost.json`` and ``.md``: CPU time of value and gradient over that of the value, worlds side by side, interleaved
 in one process; and temporary memory of the gradient of a long rollout, from the compiler, plain and with `long_rollout`.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import pathlib
 import time
@@ -29,6 +30,7 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 STEPS, LONG = 20, 1000
 DT = 1 / 240
 RATIO_GATE, MEMORY_GATE = 3.0, 2048
+RUNS = {"rollout": rollout, "long_rollout": long_rollout}
 
 
 def chain(links: int) -> tuple[Any, Any]:
@@ -55,8 +57,15 @@ def loss(model: Any, state: Any, velocity: Any, run: Any, steps: int) -> Any:
     return jnp.sum(run(model, dataclasses.replace(state, velocity=velocity), steps)[0].position)
 
 
-def measure(name: str) -> dict[str, Any]:
-    """Ratio of CPU times and bytes a body and step, of one scene."""
+def measure_memory(name: str) -> dict[str, Any]:
+    """Bytes a body and step."""
+    model, state = SCENES[name]()
+    bodies = len(model.scene.dynamic_bodies)
+    return {label: memory(model, state, run) / (LONG * bodies) for label, run in RUNS.items()}
+
+
+def measure_time(name: str) -> dict[str, Any]:
+    """Ratio of CPU times, rate of the gradient and CPU seconds to compile."""
     model, state = SCENES[name]()
     velocity = jnp.repeat(state.velocity[None], GRADIENT_BATCH, axis=0)
     started = time.process_time()
@@ -75,14 +84,14 @@ def measure(name: str) -> dict[str, Any]:
 
     contestants = {"value": Contestant(block(forward), {}), "gradient": Contestant(block(backward), {})}
     interleave(contestants, QUICK)
-    bodies = len(model.scene.dynamic_bodies)
     return {
         "ratio": paired_ratio(contestants["value"], contestants["gradient"])["median"],
         "rate": float(np.median(contestants["gradient"].cpu_rates)),
         "compile": compiling,
-        "plain": memory(model, state, rollout) / (LONG * bodies),
-        "kept": memory(model, state, long_rollout) / (LONG * bodies),
     }
+
+
+MEASURES = {"memory": measure_memory, "time": measure_time}
 
 
 def memory(model: Any, state: Any, run: Any) -> float:
@@ -105,10 +114,17 @@ def table(found: dict[str, Any]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name, row in found.items():
-        lines.append(
-            f"| {name} | {row['ratio']:.2f} | {row['rate']:.3g} | {row['plain']:.0f} | {row['kept']:.0f} | "
-            f"{row['compile'][0]:.0f} + {row['compile'][1]:.0f} |"
-        )
+        cells = ["not measured"] * 5
+        if "ratio" in row:
+            forward, backward = row["compile"]
+            cells[0], cells[1], cells[4] = (
+                f"{row['ratio']:.2f}",
+                f"{row['rate']:.3g}",
+                f"{forward:.0f} + {backward:.0f}",
+            )
+        if "rollout" in row:
+            cells[2:4] = (f"{row[label]:.0f}" for label in RUNS)
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -116,12 +132,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Measures the chosen scenes and writes both files; what earlier runs found of others is kept."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.gradient_cost", description=__doc__)
     parser.add_argument("--scenes", default=",".join(SCENES))
+    parser.add_argument("--only", choices=sorted(MEASURES), help="default: both")
     options = parser.parse_args(arguments)
     RESULTS.mkdir(exist_ok=True)
     stored = RESULTS / "gradient_cost.json"
     found = json.loads(stored.read_text()) if stored.exists() else {}
-    for name in options.scenes.split(","):
-        found[name] = measure(name)
+    what = [options.only] if options.only else list(MEASURES)
+    for name, measure in itertools.product(options.scenes.split(","), what):
+        found[name] = {**found.get(name, {}), **MEASURES[measure](name)}
         ordered = {scene: found[scene] for scene in SCENES if scene in found}
         stored.write_text(json.dumps(ordered, indent=1) + "\n")
         (RESULTS / "gradient_cost.md").write_text(table(ordered))
