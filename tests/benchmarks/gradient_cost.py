@@ -2,8 +2,9 @@
 
     OMP_NUM_THREADS=1 python -m tests.benchmarks.gradient_cost [--scenes slide,stack,chain] [--only memory]
 
-Writes ``results/gradient_cost.json`` and ``.md``: CPU time of value and gradient over that of the value, worlds side by side, interleaved
-in one process; and temporary memory of the gradient of a long rollout, from the compiler, plain and with `long_rollout`.
+Writes ``results/gradient_cost.json`` and ``.md``: CPU time of value and gradient over that of the value, worlds side by
+side, interleaved in one process; and temporary memory of the gradient of a long rollout, from the compiler, plain and with
+`long_rollout`.
 """
 
 from __future__ import annotations
