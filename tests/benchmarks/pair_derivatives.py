@@ -202,6 +202,9 @@ def table(rows: list[dict]) -> str:
         chosen = [row for row in rows if row["pair"] == pair]
         lines.append(_line(pair, chosen))
     lines.append(_line("all", rows))
+    missing = [name for name in ("_".join(pair) for pair in PAIRS) if name not in pairs]
+    if missing:
+        lines += ["", f"Not measured: {', '.join(missing)}."]
     lines += [
         "",
         "## By pair and parameter",
