@@ -26,7 +26,7 @@ MEASUREMENTS = {
     "accuracy": ("accuracy", {}),
     "precision": ("precision", {}),
 }
-PACKAGES = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "brax")
+PACKAGES = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "brax", "pybullet")
 
 
 def main(arguments: list[str] | None = None) -> int:

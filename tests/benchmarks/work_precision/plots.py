@@ -1,0 +1,133 @@
+"""Error against work, one panel a scene, and a summary: what each engine pays for the error that MuJoCo's default has."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+from typing import Any
+
+from tests.benchmarks.work_precision import fronts
+from tests.benchmarks.work_precision.gradient import GRADIENT
+from tests.benchmarks.work_precision.scenes import SCENES
+from tests.benchmarks.work_precision.sweep import OURS
+
+FLOOR = 1e-9
+"""Relative errors of zero are drawn here."""
+COLORS = {OURS: "#0b5fa5", "MuJoCo": "#c8501e", "PyBullet": "#7a7a7a", "MJX": "#9a6fb0", "Brax spring": "#3f8f5f"}
+MARKERS = ("o", "s", "^", "D", "v", "P")
+COLUMNS = 4
+
+
+def draw(scenes: dict[str, dict], folder: pathlib.Path) -> None:
+    """Writes `work_precision.png` and `work_precision_summary.png`."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure = _multiples(scenes, pyplot)
+    figure.savefig(folder / "work_precision.png", dpi=100)
+    pyplot.close(figure)
+    figure = _summary(scenes, pyplot)
+    figure.savefig(folder / "work_precision_summary.png", dpi=110)
+    pyplot.close(figure)
+
+
+def relative(scene: str, error: float) -> float:
+    """Error as a share of the scene's scale."""
+    return error / SCENES[scene].scale if scene in SCENES else error
+
+
+def _multiples(scenes: dict[str, dict], pyplot: Any) -> Any:
+    rows = math.ceil(len(scenes) / COLUMNS)
+    columns = min(COLUMNS, len(scenes))
+    figure, panels = pyplot.subplots(
+        rows, columns, figsize=(4.6 * columns, 3.7 * rows + 0.8), layout="constrained", squeeze=False
+    )
+    handles: dict[str, Any] = {}
+    for panel, (scene, result) in zip(panels.flat, scenes.items(), strict=False):
+        _panel(panel, scene, fronts.judged(result["points"]), handles)
+    for panel in list(panels.flat)[len(scenes) :]:
+        panel.axis("off")
+    for panel in list(panels.flat)[max(0, len(scenes) - columns) : len(scenes)]:
+        panel.set_xlabel("CPU-seconds per simulated second and world")
+    for panel in panels[:, 0]:
+        panel.set_ylabel("error / scale of the scene")
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+    return figure
+
+
+def _panel(panel: Any, scene: str, points: list[dict], handles: dict[str, Any]) -> None:
+    for engine in fronts.engines(points):
+        own = fronts.of(points, engine)
+        for setting in dict.fromkeys(point["setting"] for point in own):
+            line = [point for point in own if point["setting"] == setting]
+            marker = MARKERS[_rank(engine, setting) % len(MARKERS)]
+            (drawn,) = panel.loglog(
+                [fronts.cost(point) for point in line],
+                [max(relative(scene, point["error"]), FLOOR) for point in line],
+                marker=marker, ms=4.5, lw=0.8, color=COLORS[engine], alpha=0.85,
+            )  # fmt: skip
+            handles.setdefault(f"{engine}, {setting}", drawn)
+    best = fronts.front(fronts.of(points, OURS))
+    panel.loglog(
+        [fronts.cost(point) for point in best], [max(relative(scene, point["error"]), FLOOR) for point in best],
+        lw=3, color=COLORS[OURS], alpha=0.25, zorder=0,
+    )  # fmt: skip
+    if scene in SCENES:
+        target = SCENES[scene].target
+        aim = 1 / (target.rate * fronts.TARGET_DT)
+        panel.plot(aim, relative(scene, target.error), "x", ms=10, mew=2.5, color="black")
+    panel.set_title(scene)
+    panel.grid(True, which="major", alpha=0.3)
+    panel.tick_params(labelsize=8)
+
+
+def _rank(engine: str, setting: str) -> int:
+    known = ("pgs", "pgs, 30 sweeps", "soft_step", "converged", "pgs, split at impacts")
+    return known.index(setting) if engine == OURS and setting in known else int(setting != "default")
+
+
+def reference(scene: str, points: list[dict]) -> dict | None:
+    """The peer's point that the summary is drawn at: MuJoCo's default at 1/240 s, else any other peer's there."""
+    peers = [point for point in fronts.at(points) if point["engine"] != OURS and point["error"] is not None]
+    return next((point for point in peers if point["engine"] == "MuJoCo"), peers[0] if peers else None)
+
+
+def _summary(scenes: dict[str, dict], pyplot: Any) -> Any:
+    shown = {scene: reference(scene, result["points"]) for scene, result in scenes.items()}
+    shown = {scene: point for scene, point in shown.items() if point}
+    figure, panel = pyplot.subplots(figsize=(9.5, 0.55 * max(len(shown), 1) + 1.9), layout="constrained")
+    labels = []
+    for row, (scene, peer) in enumerate(shown.items()):
+        found = {}
+        for engine in fronts.engines(scenes[scene]["points"]):
+            point = fronts.cheapest(fronts.of(scenes[scene]["points"], engine), peer["error"])
+            if point:
+                found[engine] = fronts.cost(point)
+        panel.plot([min(found.values()), max(found.values())], [row, row], color="#cccccc", lw=1.5, zorder=0)
+        for engine, value in found.items():
+            size = 9 if engine == OURS else 6.5
+            panel.plot(value, row, "o", ms=size, color=COLORS[engine], label=engine if row == 0 else None)
+        labels.append(f"{scene}\nerror at most {error_text(scene, peer['error'])}")
+    panel.set_xscale("log")
+    panel.set_yticks(range(len(shown)), labels, fontsize=8)
+    panel.invert_yaxis()
+    panel.grid(True, axis="x", which="major", alpha=0.3)
+    panel.set_xlabel("CPU-seconds per simulated second and world (left is better)")
+    panel.set_title(
+        "Cost of the error that MuJoCo's default has at 1/240 s, each engine at its cheapest setting", fontsize=10
+    )
+    handles = [
+        pyplot.Line2D([], [], marker="o", ls="", color=color, label=engine)
+        for engine, color in COLORS.items()
+        if any(engine in fronts.engines(result["points"]) for result in scenes.values())
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+    return figure
+
+
+def error_text(scene: str, error: float) -> str:
+    """An error with its unit."""
+    unit = SCENES[scene].unit if scene in SCENES else GRADIENT.unit
+    return f"{100 * error:.2g} %" if unit == "1" else f"{error:.2g} {unit}"
