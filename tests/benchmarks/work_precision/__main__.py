@@ -73,7 +73,7 @@ def _measure(name: str, settings: Settings) -> dict:
 
 
 def write(report: dict, output: pathlib.Path) -> None:
-    """Writes `work_precision.json`, `.md`, both plots and `error_table.json`; a full set also updates the package's."""
+    """Writes `work_precision.json`, `.md`, both plots and `error_table.json`: a complete set into the package."""
     order = [name for name in (*SCENES, GRADIENT.name) if name in report["scenes"]]
     report["scenes"] = {name: report["scenes"][name] for name in order}
     measured = {name: result for name, result in report["scenes"].items() if "failed" not in result}
@@ -81,9 +81,8 @@ def write(report: dict, output: pathlib.Path) -> None:
     table = json.dumps(report["error_table"], indent=1) + "\n"
     (output / "work_precision.json").write_text(json.dumps(report, indent=1) + "\n")
     (output / "work_precision.md").write_text(markdown(report))
-    (output / "error_table.json").write_text(table)
-    if output == RESULTS and set(SCENES) <= set(measured):
-        PACKAGE_TABLE.write_text(table)
+    complete = output == RESULTS and set(SCENES) <= set(measured)
+    (PACKAGE_TABLE if complete else output / PACKAGE_TABLE.name).write_text(table)
     if measured:
         plots.draw(measured, output)
 

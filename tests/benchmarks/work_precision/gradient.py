@@ -29,15 +29,19 @@ TIME_STEPS = (1 / 60, 1 / 240)
 
 
 class Gradient(NamedTuple):
-    """Name, unit and truth, as of a `Scene`."""
+    """Name, unit and truth, as of a `Scene`, and the error at which costs are compared."""
 
     name: str
     unit: str
     truth: str
+    aim: float
 
 
 GRADIENT = Gradient(
-    "slide gradient", "1", "d distance / d speed of the sliding cube, after it stopped, against v / (mu g)"
+    "slide gradient",
+    "1",
+    "d distance / d speed of the sliding cube, after it stopped, against v / (mu g)",
+    0.01,
 )
 
 

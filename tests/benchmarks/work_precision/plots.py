@@ -1,4 +1,4 @@
-"""Error against work, one panel a scene, and a summary: what each engine pays for the error that MuJoCo's default has."""
+"""Error against work, one panel a scene, and a summary: what each engine pays for the error of the target."""
 
 from __future__ import annotations
 
@@ -88,36 +88,33 @@ def _rank(engine: str, setting: str) -> int:
     return known.index(setting) if engine == OURS and setting in known else int(setting != "default")
 
 
-def reference(scene: str, points: list[dict]) -> dict | None:
-    """The peer's point that the summary is drawn at: MuJoCo's default at 1/240 s, else any other peer's there."""
-    peers = [point for point in fronts.at(points) if point["engine"] != OURS and point["error"] is not None]
-    return next((point for point in peers if point["engine"] == "MuJoCo"), peers[0] if peers else None)
+def aimed(scene: str) -> float:
+    """Error [unit of the scene] at which the summary compares costs: that of the target."""
+    return SCENES[scene].target.error if scene in SCENES else GRADIENT.aim
 
 
 def _summary(scenes: dict[str, dict], pyplot: Any) -> Any:
-    shown = {scene: reference(scene, result["points"]) for scene, result in scenes.items()}
-    shown = {scene: point for scene, point in shown.items() if point}
-    figure, panel = pyplot.subplots(figsize=(9.5, 0.55 * max(len(shown), 1) + 1.9), layout="constrained")
+    figure, panel = pyplot.subplots(figsize=(9.5, 0.5 * len(scenes) + 1.9), layout="constrained")
     labels = []
-    for row, (scene, peer) in enumerate(shown.items()):
-        found = {}
-        for engine in fronts.engines(scenes[scene]["points"]):
-            point = fronts.cheapest(fronts.of(scenes[scene]["points"], engine), peer["error"])
+    for row, (scene, result) in enumerate(scenes.items()):
+        error, found = aimed(scene), {}
+        for engine in fronts.engines(result["points"]):
+            point = fronts.cheapest(fronts.of(result["points"], engine), error)
             if point:
                 found[engine] = fronts.cost(point)
-        panel.plot([min(found.values()), max(found.values())], [row, row], color="#cccccc", lw=1.5, zorder=0)
+        if found:
+            panel.plot([min(found.values()), max(found.values())], [row, row], color="#cccccc", lw=1.5, zorder=0)
         for engine, value in found.items():
-            size = 9 if engine == OURS else 6.5
-            panel.plot(value, row, "o", ms=size, color=COLORS[engine], label=engine if row == 0 else None)
-        labels.append(f"{scene}\nerror at most {error_text(scene, peer['error'])}")
+            panel.plot(value, row, "o", ms=9 if engine == OURS else 6.5, color=COLORS[engine])
+        labels.append(f"{scene}\nerror at most {error_text(scene, error)}")
     panel.set_xscale("log")
-    panel.set_yticks(range(len(shown)), labels, fontsize=8)
+    panel.set_yticks(range(len(scenes)), labels, fontsize=8)
+    panel.set_ylim(-0.6, len(scenes) - 0.4)
     panel.invert_yaxis()
     panel.grid(True, axis="x", which="major", alpha=0.3)
     panel.set_xlabel("CPU-seconds per simulated second and world (left is better)")
-    panel.set_title(
-        "Cost of the error that MuJoCo's default has at 1/240 s, each engine at its cheapest setting", fontsize=10
-    )
+    title = "What an error costs: each engine at its cheapest setting and time step; no dot: not reached"
+    panel.set_title(title, fontsize=10)
     handles = [
         pyplot.Line2D([], [], marker="o", ls="", color=color, label=engine)
         for engine, color in COLORS.items()
