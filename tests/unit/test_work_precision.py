@@ -144,7 +144,7 @@ def test_engines_get_the_same_bodies(name):
     scene = SCENES[name]
     for profile in mujoco_engine.PROFILES:
         peer = mujoco.MjModel.from_xml_string(mujoco_engine.xml(scene, profile, DT))
-    model, state = engine.build(scene.world, engine.undamped("pgs"))
+    model, state = engine.build(scene.world, engine.undamped(scene, "pgs"))
     moving = slice(len(state.position) - len(scene.world.moving), None)
     first = peer.nbody - len(scene.world.moving)
     np.testing.assert_allclose(peer.body_mass[first:], model.mass[moving], rtol=1e-6)

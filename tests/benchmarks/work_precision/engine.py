@@ -12,7 +12,7 @@ from mathota_jax import Hinge, Options, SceneBuilder, Sphere
 from tests.benchmarks.ours import batched_step, repeat
 from tests.benchmarks.solver_tiers import TIERS
 from tests.benchmarks.work_precision.jax_program import JaxProgram
-from tests.benchmarks.work_precision.scenes import Scene, start_of
+from tests.benchmarks.work_precision.scenes import TIGHT, Scene, start_of
 from tests.benchmarks.work_precision.worlds import Motion, World
 
 SETTINGS = {**TIERS, "pgs, split at impacts": {"impact_events": 2}}
@@ -40,9 +40,10 @@ def build(world: World, options: Options) -> tuple[Any, Any]:
     return builder.build(options)
 
 
-def undamped(setting: str) -> Options:
-    """Options of a setting, without damping, which no truth contains."""
-    return Options(dt=DT, linear_damping=0.0, angular_damping=0.0, **SETTINGS[setting])
+def undamped(scene: Scene, setting: str) -> Options:
+    """Options of a setting for a scene, without damping, which no truth contains."""
+    changes = {"pair_capacity": scene.capacity} if setting == TIGHT else SETTINGS[setting]
+    return Options(dt=DT, linear_damping=0.0, angular_damping=0.0, **changes)
 
 
 def program(scene: Scene, options: Options, count: int) -> JaxProgram:

@@ -124,7 +124,7 @@ def _linear_cost(scenes: dict[str, dict], setting: str) -> dict | None:
     for name in kinds_of_all(scenes):
         found = [p for p in at(of(scenes[name]["points"], OURS)) if p["setting"] == setting]
         if found:
-            model, _ = engine.build(SCENES[name].world, engine.undamped(setting))
+            model, _ = engine.build(SCENES[name].world, engine.undamped(SCENES[name], setting))
             rows.append((1, *scene_sizes(model.scene)))
             costs.append(1 / found[0]["rate"])
     if not rows:

@@ -26,6 +26,7 @@ class JaxProgram:
       step: (parameters, states) -> states.
       motion: (states, number of worlds) -> `Motion` of the first worlds.
       count: number of worlds.
+      final: states at the end of the last record.
     """
 
     parameters: Callable[[float], Any]
@@ -33,6 +34,7 @@ class JaxProgram:
     step: Callable[[Any, Any], Any]
     motion: Callable[[Any, int], Motion]
     count: int
+    final: Any = None
 
     @functools.cached_property
     def _compiled(self) -> tuple[Any, float]:
@@ -61,6 +63,7 @@ class JaxProgram:
         for step in kept_steps(scene, dt):
             states, done = self._compiled[0](parameters, states, np.int32(step - done)), step
             frames.append(self.motion(states, scene.worlds))
+        self.final = states
         return stack(frames)
 
     def block(self, scene: Scene, dt: float) -> Block:

@@ -8,6 +8,7 @@ from typing import Any
 
 from tests.benchmarks.work_precision import fronts
 from tests.benchmarks.work_precision.gradient import GRADIENT
+from tests.benchmarks.work_precision.scenes import OURS as SETTINGS
 from tests.benchmarks.work_precision.scenes import SCENES
 from tests.benchmarks.work_precision.sweep import OURS
 
@@ -84,8 +85,9 @@ def _panel(panel: Any, scene: str, points: list[dict], handles: dict[str, Any]) 
 
 
 def _rank(engine: str, setting: str) -> int:
-    known = ("pgs", "pgs, 30 sweeps", "soft_step", "converged", "pgs, split at impacts")
-    return known.index(setting) if engine == OURS and setting in known else int(setting != "default")
+    if engine != OURS:
+        return int(setting != "default")
+    return SETTINGS.index(setting) if setting in SETTINGS else len(SETTINGS)
 
 
 def aimed(scene: str) -> float:

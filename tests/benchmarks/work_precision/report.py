@@ -220,6 +220,7 @@ def _points(name: str, result: dict) -> list[str]:
         error, median = point["error"], point.get("error_median")
         cells = ("not finite", "") if error is None else (error_text(name, error), error_text(name, median or error))
         mark = "yes" if id(point) in best else ""
+        mark += f" (flags {point['flags']})" if point.get("flags") else ""
         shown = (point["engine"], point["setting"], _dt(point["dt"]), point["batch"], *cells, rate(point["rate"]), mark)
         lines.append(_row(shown))
     return [*lines, ""]

@@ -20,6 +20,8 @@ from tests.scenes import GRAVITY, angle_between, axis_angle, quaternion_product,
 
 OURS = ("pgs", "pgs, 30 sweeps", "soft_step", "converged")
 """Settings of the engine that every scene is run with; see `engine.SETTINGS`."""
+TIGHT = "pgs, tight capacity"
+"""Setting that makes room for `Scene.capacity` close pairs, no more."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +50,7 @@ class Scene:
       worlds: different worlds whose errors are taken.
       batches: numbers of worlds at which our throughput is looked for.
       finest: smallest time step [s]; runs of many bodies take long.
+      capacity: close pairs that the scene needs room for, of `TIGHT`.
       settings: of our engine.
       tuned: options of MuJoCo's tuned profile, by element of its model.
       default: what its default profile needs to take part at all.
@@ -69,6 +72,7 @@ class Scene:
     worlds: int = 8
     batches: tuple[int, ...] = (128, 512, 2048)
     finest: float = 1 / 1000
+    capacity: int | None = None
     settings: tuple[str, ...] = OURS
     tuned: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
     default: dict[str, dict[str, str]] = dataclasses.field(default_factory=dict)
@@ -319,6 +323,7 @@ SCENES = {
         Scene(
             "stack10", "sink or sideways motion of ten stacked cubes of 0.2 m after 5 s", "mm", 200.0, "stack",
             boxes((1.0,) * 10, 0.5), 5.0, _standing, Target(1e5, 0.2), finest=1 / 480, worlds=1, batches=(8, 32, 128),
+            capacity=16, settings=(*OURS, TIGHT),
             tuned=STIFF, peers=("PyBullet",),
         ),
         Scene(
@@ -336,12 +341,14 @@ SCENES = {
         Scene(
             "pile27 spheres", "largest penetration of 27 spheres of 0.1 m radius at rest in a bin", "mm", 200.0, "pile",
             pile(Sphere(PILE_SIZE), 2.2 * PILE_SIZE, 0.35, 0.0), 3.0, _resting_overlap("pile27 spheres"),
-            Target(12e3, 3.0), finest=1 / 480, worlds=1, frames=12, batches=(8, 32), tuned=STIFF, peers=("PyBullet",),
+            Target(12e3, 3.0), finest=1 / 480, worlds=1, frames=12, batches=(8, 32),
+            capacity=100, settings=(*OURS, TIGHT), tuned=STIFF, peers=("PyBullet",),
         ),
         Scene(
             "pile27 boxes", "largest penetration of 27 cubes of 0.2 m at rest in a bin", "mm", 200.0, "pile",
             pile(Box((PILE_SIZE,) * 3), 2.5 * PILE_SIZE, 0.4, 0.15), 3.0, _resting_overlap("pile27 boxes"),
-            Target(20e3, 9.0), finest=1 / 480, worlds=1, frames=12, batches=(8, 32), tuned=STIFF, peers=("PyBullet",),
+            Target(20e3, 9.0), finest=1 / 480, worlds=1, frames=12, batches=(8, 32),
+            capacity=100, settings=(*OURS, TIGHT), tuned=STIFF, peers=("PyBullet",),
         ),
         Scene(
             "hulls8", "largest penetration of 8 hulls of 0.24 m at rest on a plane", "mm", 240.0, "pile",

@@ -38,6 +38,7 @@ class Point:
     compile_cpu_seconds: float
     bytes_per_world: Callable[[], float | None]
     profile: dict | None = None
+    flags: Callable[[], int] = lambda: 0
 
 
 def measure(settings: Settings, scene: str) -> dict:
@@ -69,6 +70,7 @@ def measure(settings: Settings, scene: str) -> dict:
             "compile_cpu_seconds": point.compile_cpu_seconds,
             "bytes_per_world": point.bytes_per_world(),
             "profile": point.profile,
+            "flags": point.flags(),
         }
         found.append(entry)
         if seconds < SECONDS_OF_A_POINT:
@@ -104,6 +106,7 @@ def _jax_point(engine_name: str, setting: str, scene: Scene, program: JaxProgram
         block=program.block(scene, dt),
         compile_cpu_seconds=program.compile_seconds,
         bytes_per_world=lambda: program.bytes_per_world,
+        flags=lambda: int(np.bitwise_or.reduce(np.asarray(getattr(program.final, "flags", [0])))),
     )
 
 
@@ -111,7 +114,7 @@ def _ours(scene: Scene, settings: Settings) -> tuple[list[Point], list[dict]]:
     """All settings, at the number of worlds at which the first one is fastest."""
     programs, batches = {}, []
     for count in scene.batches[:1] if settings.mode == "quick" else scene.batches:
-        program = engine.program(scene, engine.undamped(scene.settings[0]), max(count, scene.worlds))
+        program = engine.program(scene, engine.undamped(scene, scene.settings[0]), max(count, scene.worlds))
         probe = Contestant(program.block_of(PROBE_STEPS, engine.DT), {})
         interleave({"": probe}, dataclasses.replace(settings, rounds=5))
         rate = probe.report()["cpu_rate"]["median"]
@@ -121,7 +124,7 @@ def _ours(scene: Scene, settings: Settings) -> tuple[list[Point], list[dict]]:
     points = []
     for setting in scene.settings:
         first = setting == scene.settings[0]
-        program = best if first else engine.program(scene, engine.undamped(setting), best.count)
+        program = best if first else engine.program(scene, engine.undamped(scene, setting), best.count)
         points += [_jax_point(OURS, setting, scene, program, dt) for dt in _time_steps(scene, settings)]
     return points, batches
 
