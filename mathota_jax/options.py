@@ -168,7 +168,8 @@ class Options:
           error: relative to the scale of a scene: distance, height or speed of one moving body, edge of stacked boxes,
             length of a chain, diameter of the bodies of a pile; between 0 and 1.
           kind: "single": one body that flies, tumbles, slides, rolls, bounces or sticks. "stack": ten equal boxes.
-            "mass_ratio": 1000 kg on 1 kg. "chain": ten links. "pile": 27 bodies in a bin, hulls in a heap. "any": all.
+            "mass_ratio": 1000 kg on 1 kg. "chain": ten links. "pile": 27 bodies in a bin, hulls in a heap. "any": all but
+            piles.
           **changes: other fields of `Options`.
 
         Raises:

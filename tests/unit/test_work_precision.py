@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Polyhedron, Sphere
+from mathota_jax.step import step_worlds_last
 from tests.benchmarks.work_precision import engine, fronts, mujoco_engine
-from tests.benchmarks.work_precision.features import count_equations
+from tests.benchmarks.work_precision.features import count_equations, worlds_last
 from tests.benchmarks.work_precision.overlap import deepest
 from tests.benchmarks.work_precision.scenes import SCENES, kept_steps, start_of, steps_of
 from tests.benchmarks.work_precision.worlds import Body, plane, stack
@@ -194,6 +195,16 @@ def test_a_target_counts_only_what_keeps_its_error():
     points = [point(10 * target.error, 9 * target.rate), point(target.error, 0.5 * target.rate)]
     assert fronts.verdict("slide", points).ratio == pytest.approx(0.5)
     assert fronts.verdict("slide", points[:1]).point is None
+
+
+def test_equations_of_a_step_grow_with_what_the_scene_has():
+    def equations(name):
+        model, state = engine.build(SCENES[name].world, engine.undamped(SCENES[name], "pgs"))
+        return count_equations(jax.make_jaxpr(step_worlds_last)(*worlds_last(model, state), np.zeros((0, 1))).jaxpr)
+
+    box_on_plane = equations("slide")
+    assert 100 < equations("roll") < box_on_plane
+    assert 100 < equations("tumble") < box_on_plane
 
 
 def test_equations_inside_a_loop_count():

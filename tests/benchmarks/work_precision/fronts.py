@@ -83,10 +83,11 @@ def against(points: list[Point], peer: Point) -> tuple[Point | None, float]:
 def error_table(scenes: dict[str, dict], source: str) -> dict:
     """For each kind of scene, setting and time step the worst relative error and the mean cost over the scenes of the kind.
 
-    Kind "any" is all scenes. The cost [CPU-seconds per simulated second and world] is a geometric mean.
+    Kind "any" is all scenes that every setting is run with. The cost [CPU-seconds per simulated second and world] is a
+    geometric mean.
     """
-    kinds = {"any": kinds_of_all(scenes)}
-    for name in kinds["any"]:
+    kinds = {"any": [name for name in kinds_of_all(scenes) if set(SETTINGS_OF_ALL) <= set(SCENES[name].settings)]}
+    for name in kinds_of_all(scenes):
         kinds.setdefault(SCENES[name].kind, []).append(name)
     entries = []
     for kind, names in kinds.items():
