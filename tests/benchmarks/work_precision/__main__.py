@@ -17,7 +17,7 @@ from tests.benchmarks.work_precision.gradient import GRADIENT
 from tests.benchmarks.work_precision.report import markdown, summary
 from tests.benchmarks.work_precision.scenes import SCENES
 
-FULL = Settings(rounds=7, block_seconds=0.1, warmup_blocks=0, time_steps=(1 / 60, 1 / 120, 1 / 240, 1 / 480, 1 / 1000))
+FULL = Settings(rounds=5, block_seconds=0.1, warmup_blocks=0, time_steps=(1 / 60, 1 / 120, 1 / 240, 1 / 1000))
 QUICK = Settings(
     mode="quick", rounds=3, block_seconds=0.05, warmup_blocks=0, time_steps=(1 / 60, 1 / 240), timeout_seconds=1200.0
 )

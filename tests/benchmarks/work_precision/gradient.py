@@ -24,8 +24,8 @@ from tests.benchmarks.work_precision.scenes import SCENES, start_of, steps_of
 
 WORLDS = 256
 DIFFERENCE = 0.05
-"""Half the distance of the two launch speeds of a central difference [m/s]. The truth is quadratic in the speed, so that only
-the noise of the contacts counts, which a large distance makes small."""
+"""Half the distance of the two launch speeds of a central difference [m/s]. The truth is quadratic in the speed, so that
+only the noise of the contacts counts, which a large distance makes small."""
 TIME_STEPS = (1 / 60, 1 / 240)
 
 

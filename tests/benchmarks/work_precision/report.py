@@ -31,7 +31,7 @@ def markdown(report: dict) -> str:
         "- Ours: `vmap(step)` in a loop, float32, no damping, otherwise the defaults of the named setting; the number of "
         "worlds is the best of those tried with the first setting. Peers: MuJoCo and PyBullet one world after the other in "
         "one thread, float64; MJX and Brax a batch, float32. Their defaults and a tuned profile, named below. Runs of more "
-        "than three seconds are timed once",
+        "than two seconds are timed once",
     ]
     if settings["mode"] == "quick":
         lines.append("- **Quick run: few rounds and batches, too short for publication**")

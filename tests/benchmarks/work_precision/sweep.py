@@ -19,7 +19,7 @@ from tests.benchmarks.work_precision.worlds import Motion
 OURS = "mathota_jax"
 SLOW_STEPS = (1 / 60, 1 / 240)
 """Time steps of engines whose runs take long."""
-SECONDS_OF_A_POINT = 3.0
+SECONDS_OF_A_POINT = 2.0
 """A block that takes long is run in fewer rounds; one that takes longer is timed once, with the frames it is judged by."""
 PROBE_STEPS = 60
 
