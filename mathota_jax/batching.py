@@ -131,7 +131,13 @@ class Pullback:
         ]
         restricted = _restricted(self.native, primals, self.mask)
         outputs, pull = jax.vjp(restricted, *linear)
-        return list(pull([jnp.broadcast_to(c, o.shape) for c, o in zip(cotangents, outputs, strict=True)]))
+        return list(pull([_cotangent_of(output, c) for output, c in zip(outputs, cotangents, strict=True)]))
+
+
+def _cotangent_of(output: Array, cotangent: Array) -> Array:
+    """The cotangent in the shape of its output; one that all worlds share depends on nothing that is differentiated."""
+    shared = output.shape[-1] < cotangent.shape[-1]
+    return jnp.zeros_like(output) if shared else jnp.broadcast_to(cotangent, output.shape)
 
 
 def _restricted(native: Native, primals: list[Array], mask: tuple[bool, ...]) -> Callable[..., list[Array]]:

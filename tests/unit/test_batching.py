@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Hinge, Plane, SceneBuilder, Sphere, rollout, step
+from mathota_jax import Hinge, Plane, SceneBuilder, Sphere, contacts, rollout, step
 from tests.scenes import stack, undamped
 
 WORLDS, STEPS = 3, 3
@@ -232,3 +232,16 @@ def test_batch_of_one_and_bitwise_repeatability(precision):
     again = jax.jit(jax.vmap(step))(stack(models[:1]), stack(states[:1]), stack(actions[:1]))
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_an_output_that_all_worlds_share_has_no_derivative():
+    """The normal of a plane depends on nothing that a ball does."""
+    builder = SceneBuilder()
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True)
+    builder.add_body(Sphere(0.1), mass=1.0, position=(0, 0.1, 0))
+    model, state = builder.build()
+
+    def normal(position):
+        return contacts(model, dataclasses.replace(state, position=position)).normal
+
+    assert not jax.jacrev(normal)(state.position).any()
