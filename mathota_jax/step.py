@@ -149,13 +149,13 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     problem = constrain(model, state, bodies, blocks, acting, free, carried, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
     start = starting_impulses(model, state, problem, acting, packed)
-    lever, gained, failed = None, None, None
+    lever, beyond, gained, failed = None, None, None, None
     if scene.options.solver == "soft_step":
         solved, gained, impulses = small_steps(model, problem, blocks, packed, start)
     else:
         solved, impulses, failed = solve_rows(scene, problem, packed, start)
-        lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
-    moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, gained)
+        lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
+    moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, beyond, gained)
     moved, displacement = compute_once((moved, displacement), state.position)
     if scene.options.solver != "soft_step":
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)
