@@ -64,6 +64,7 @@ class Case:
       measure: names and values of what is measured, units in the names.
       gates: largest value of each measurement that has a gate.
       tiers: keys of `TIERS` to report.
+      tested: those that are to carry the scene (docs/solvers.md), and must meet the gates.
       dt: [s].
       settings: further options.
       force: constant force [N] on body 1.
@@ -78,6 +79,7 @@ class Case:
     measure: Measure
     gates: Mapping[str, float]
     tiers: tuple[str, ...]
+    tested: tuple[str, ...]
     dt: float = 1 / 60
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     force: tuple[float, float, float] | None = None
@@ -138,7 +140,7 @@ def overlap_of_balls(run: Run, radius: float = 0.1) -> dict[str, float]:
     total = 0.0
     for place in run.position[:, 1:]:
         gap = np.linalg.norm(place[:, None] - place[None], axis=-1)[np.triu_indices(len(place), 1)] - 2 * radius
-        total += (np.minimum(gap, 0.0) ** 2).sum() + (np.minimum(place[:, 1] - radius, 0.0) ** 2).sum()
+        total += float((np.minimum(gap, 0.0) ** 2).sum() + (np.minimum(place[:, 1] - radius, 0.0) ** 2).sum())
     return {"sum of squared overlaps [m^2]": total / len(run.position)}
 
 
@@ -219,133 +221,238 @@ ALL = ("pgs", "soft_step", "converged")
 FINER = tuple(TIERS)
 DAMPED = {"linear_damping": 0.1, "angular_damping": 0.1}
 REST = {"dip / size": 0.01, "sideways / size": 0.005}
+BEARS = {"pressed into the ground / size": 0.2, "largest speed after 5 s [m/s]": 5.0}
 DIAGONAL = np.array([0.5, 0.0, 0.866]) / np.hypot(0.5, 0.866)
 
 
-def _rolling(name: str, along: np.ndarray) -> Case:
+def _rolling(name: str, along: np.ndarray, peers: str) -> Case:
     return Case(
-        "A1", f"balls on a board, pushed {name}", hard_scenes.rolling_balls, 4.0, lambda run: rolling(run, along),
-        {"squared error of the velocities [m^2/s^2]": 1e-6}, ("pgs", "pgs, 40 sweeps", "converged"), dt=1e-3,
-        force=tuple(ROLLING_PUSH * along), peers=f"squared error, 10 / 40 iterations: {ROLLING_PEERS[name]}",
-    )  # fmt: skip
+        "A1",
+        f"balls on a board, pushed {name}",
+        hard_scenes.rolling_balls,
+        4.0,
+        lambda run: rolling(run, along),
+        {"squared error of the velocities [m^2/s^2]": 1e-6},
+        ("pgs", "pgs, 40 sweeps", "converged"),
+        ("pgs", "converged"),
+        dt=1e-3,
+        force=tuple(ROLLING_PUSH * along),
+        peers=f"10 / 40 iterations: {peers}",
+    )
 
 
-ROLLING_PEERS = {
-    "along an axis": "RaiSim 1.9e-6 / 4.1e-7, Bullet 8.6e-7 / 6.1e-15, ODE 4.8e-7 / 7.7e-9, MuJoCo 2e-3 to 9e-3, DART 0.43",
-    "diagonally": "RaiSim 4.1e-7, Bullet 4e-27, ODE and DART 3.1: the board does not move",
-}
+def _collapsing(dt: float) -> Case:
+    return Case(
+        "A3",
+        f"collapsing block of 216 balls, dt {dt:.4f}",
+        hard_scenes.block_of_balls,
+        10.0,
+        overlap_of_balls,
+        {"sum of squared overlaps [m^2]": 135 * dt**2},
+        ("pgs",),
+        ("pgs",),
+        dt=dt,
+        peers="at 1e-3: RaiSim 1.35e-4, ODE 1.57e-4, DART 2.8e-4, MuJoCo 0.095, Bullet 0.38; at 1e-2: RaiSim 0.0153, "
+        "ODE 0.016, MuJoCo 0.93, Bullet 37",
+    )
+
+
+def _elastic(dt: float, squared: float) -> Case:
+    return Case(
+        "A4",
+        f"elastic block of 216 balls, dt {dt:.4f}",
+        lambda options: hard_scenes.block_of_balls(options, lowest=1.101, restitution=1.0),
+        10.0,
+        energy_of_balls,
+        {"energy gained / that at the start": 1e-4, "mean squared error of the energy [J^2]": squared},
+        ("pgs",),
+        ("pgs",),
+        dt=dt,
+        peers="mean squared error at 1e-3: RaiSim 8.4, ODE 112, Bullet 4.1e4, DART 3.5e5; at 1e-2: 5e6 to 1e10",
+    )
+
+
+def _cubes(ratio: float, tiers: tuple[str, ...], tested: tuple[str, ...], peers: str) -> Case:
+    return Case(
+        "B1",
+        f"cube of {ratio:g} times the mass on a cube",
+        lambda options: hard_scenes.two_cubes(ratio, options),
+        2.0,
+        lambda run: standing(run, 0.2),
+        REST,
+        tiers,
+        tested,
+        peers=peers,
+    )
+
+
+def _loaded_pyramid(ratio: float) -> Case:
+    return Case(
+        "B2a",
+        f"pyramid hit by a box of density {ratio:g}",
+        lambda options: hard_scenes.loaded_pyramid(ratio, options),
+        10.0,
+        lambda run: bearing(run, slice(1, None), 1.0),
+        BEARS,
+        ("pgs", "soft_step"),
+        ("pgs", "soft_step"),
+    )
+
+
+def _two_small(ratio: int, depth: float) -> Case:
+    return Case(
+        "B2b",
+        f"box of {ratio} times the mass on two small ones",
+        lambda options: hard_scenes.big_on_two_small(depth, options),
+        8.0,
+        lambda run: bearing(run, slice(1, 3), 0.5),
+        BEARS,
+        FINER,
+        ("converged",),
+    )
+
+
+def _stack(count: int, tested: tuple[str, ...], peers: str) -> Case:
+    return Case(
+        "B3",
+        f"stack of {count} cubes",
+        lambda options: box_stack(count, 0.5, options, friction=0.6),
+        10.0,
+        lambda run: standing(run, float(count)),
+        REST,
+        ALL,
+        tested,
+        peers=peers,
+    )
+
+
+def _card_house(dt: float, tiers: tuple[str, ...], tested: tuple[str, ...]) -> Case:
+    return Case(
+        "B5a",
+        f"card house, dt {dt:.4f}",
+        hard_scenes.card_house,
+        10.0,
+        house,
+        {"cards fallen": 0.0, "drop of the top [m]": 0.028, "creep [m/s]": 5e-4},
+        tiers,
+        tested,
+        dt=dt,
+        peers="fallen: PyBullet (50 iterations) 7 at 1/60, 18 at 1/240; MuJoCo 10 at 1/60, 0 at 1/240 (drop 35 mm)",
+    )
+
 
 CASES: tuple[Case, ...] = (
-    _rolling("along an axis", np.array([0.0, 0.0, 1.0])),
-    _rolling("diagonally", DIAGONAL),
-    *(
-        Case(
-            "A3", f"collapsing block of 216 balls, dt {dt:g}", hard_scenes.block_of_balls, 10.0, overlap_of_balls,
-            {"sum of squared overlaps [m^2]": 135 * dt**2}, tiers, dt=dt,
-            peers="sum at 1e-3: RaiSim 1.35e-4, ODE 1.57e-4, DART 2.8e-4, MuJoCo 0.095, Bullet 0.38; at 1e-2: 0.0153, 0.016, "
-            "-, 0.93, 37",
-        )
-        for dt, tiers in ((1 / 240, ("pgs", "soft_step")), (1e-3, ("pgs",)))
+    _rolling(
+        "along an axis",
+        np.array([0.0, 0.0, 1.0]),
+        "RaiSim 1.9e-6 / 4.1e-7, Bullet 8.6e-7 / 6.1e-15, ODE 4.8e-7 / 7.7e-9; MuJoCo 2e-3 to 9e-3; DART 0.43",
     ),
-    *(
-        Case(
-            "A4", f"elastic block of 216 balls, dt {dt:g}",
-            lambda o: hard_scenes.block_of_balls(o, lowest=1.101, restitution=1.0), 10.0, energy_of_balls,
-            {"energy gained / that at the start": 1e-4, "mean squared error of the energy [J^2]": squared}, tiers, dt=dt,
-            peers="mean squared error at 1e-3: RaiSim 8.4, ODE 112, Bullet 4.1e4, DART 3.5e5; at 1e-2: 5e6 to 1e10",
-        )
-        for dt, squared, tiers in ((1 / 240, np.inf, ("pgs", "soft_step")), (1e-3, 10.0, ("pgs",)))
-    ),
-    *(
-        Case(
-            "B1", f"cube of {ratio:g} times the mass on a cube", lambda o, r=ratio: hard_scenes.two_cubes(r, o), 2.0,
-            lambda run: standing(run, 0.2), REST, tiers,
-            peers={
-                1e2: "sink / size: PyBullet (50 iterations) 0.021, MuJoCo 0.05",
-                1e3: "PyBullet: small cube thrown out; MuJoCo 0.48 of the size; RaiSim and other per-contact solvers fail",
-                1e5: "MuJoCo and PyBullet: swallowed or thrown out",
-            }.get(ratio, ""),
-        )
-        for ratio, tiers in ((1.0, FINER), (1e2, FINER), (1e3, FINER), (1e5, ("converged",)))
-    ),
-    *(
-        Case(
-            "B2a", f"pyramid hit by a box of density {ratio:g}", lambda o, r=ratio: hard_scenes.loaded_pyramid(r, o), 10.0,
-            lambda run: bearing(run, slice(1, None), 1.0),
-            {"pressed into the ground / size": 0.2, "largest speed after 5 s [m/s]": 5.0}, ALL if ratio == 100 else ALL[:2],
-        )
-        for ratio in (100.0, 200.0, 300.0)
-    ),
-    *(
-        Case(
-            "B2b", f"box of {ratio} times the mass on two small ones", lambda o, d=depth: hard_scenes.big_on_two_small(d, o),
-            8.0, lambda run: bearing(run, slice(1, 3), 0.5),
-            {"pressed into the ground / size": 0.2, "largest speed after 5 s [m/s]": 5.0}, FINER,
-        )
-        for ratio, depth in ((400, 10.0), (8000, 0.5))
-    ),
+    _rolling("diagonally", DIAGONAL, "RaiSim 4.1e-7, Bullet 4e-27; ODE and DART 3.1, the board does not move"),
+    _collapsing(1 / 240),
+    _collapsing(1e-3),
+    _elastic(1 / 240, np.inf),
+    _elastic(1e-3, 10.0),
+    _cubes(1.0, FINER, ("pgs", "soft_step", "converged"), ""),
+    _cubes(1e2, FINER, ("converged",), "dip: PyBullet (50 iterations) 0.021, MuJoCo 0.05"),
+    _cubes(1e3, FINER, ("converged",), "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails"),
+    _loaded_pyramid(100.0),
+    _loaded_pyramid(300.0),
+    _two_small(400, 10.0),
+    _two_small(8000, 0.5),
     Case(
-        "B2c", "cube on crossed sticks, mass ratio 200", hard_scenes.crossed_sticks, 8.0,
+        "B2c",
+        "cube on crossed sticks, mass ratio 200",
+        hard_scenes.crossed_sticks,
+        8.0,
         lambda run: {**bearing(run, slice(2, None), 0.2), **standing(run, 0.4, 2)},
-        {"pressed into the ground / size": 0.2, "largest speed after 5 s [m/s]": 5.0}, FINER,
+        BEARS,
+        ("pgs", "soft_step", "soft_step, 16 substeps", "converged"),
+        ("converged",),
     ),
-    *(
-        Case(
-            "B3", f"stack of {count} cubes", lambda o, n=count: box_stack(n, 0.5, o, friction=0.6), 10.0,
-            lambda run, n=count: standing(run, float(n)), REST, tiers,
-            peers={
-                10: "PyBullet: collapses (10 iterations), leans 0.017 of the height (50); MuJoCo: dip 0.0014",
-                20: "PyBullet collapses; MuJoCo: dip 0.0028",
-                40: "PyBullet collapses; MuJoCo: dip 0.0056; soft steps in theory 0.011",
-            }[count],
-        )
-        for count, tiers in ((10, ALL), (20, ALL), (40, ALL))
+    _stack(10, ("soft_step", "converged"), "PyBullet collapses (10 iterations), leans 0.017 (50); MuJoCo dips 0.0014"),
+    _stack(20, ("soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),
+    _stack(40, ("converged",), "PyBullet collapses; MuJoCo dips 0.0056; soft steps, in theory, 0.011"),
+    Case(
+        "B4",
+        "wall of 210 cubes",
+        lambda options: hard_scenes.wall(20, options),
+        2000 / 60,
+        lambda run: standing(run, 20.0),
+        {"dip / size": 0.01, "sideways / size": 0.01},
+        ("pgs", "soft_step"),
+        ("soft_step",),
+        peers="Box3D: a wall of base 80 falls after 1000 steps",
     ),
-    *(
-        Case(
-            "B4", f"wall of {base * (base + 1) // 2} cubes", lambda o, n=base: hard_scenes.wall(n, o), seconds,
-            lambda run, n=base: standing(run, float(n)), {"dip / size": 0.01, "sideways / size": 0.01}, tiers,
-            peers="Box3D: a wall of base 80 falls after 1000 steps",
-        )
-        for base, seconds, tiers in ((20, 2000 / 60, ("pgs", "soft_step")),)
-    ),
-    *(
-        Case(
-            "B5a", f"card house, dt {dt:.4f}", hard_scenes.card_house, 10.0, house,
-            {"cards fallen": 0.0, "drop of the top [m]": 0.028, "creep [m/s]": 5e-4}, tiers, dt=dt,
-            peers="fallen of 40: PyBullet (50 iterations) 7 at 1/60, 18 at 1/240; MuJoCo 10 at 1/60, 0 at 1/240 (drop 35 mm)",
-        )
-        for dt, tiers in ((1 / 60, ("pgs", "soft_step", "converged")), (1 / 240, ("pgs", "pgs, 40 sweeps", "soft_step")))
+    _card_house(1 / 60, ("pgs", "soft_step", "converged"), ("converged",)),
+    _card_house(1 / 240, ("pgs", "soft_step"), ("pgs",)),
+    Case(
+        "B5b",
+        "tower of 102 planks, dt 0.01",
+        hard_scenes.kapla_tower,
+        60.0,
+        lambda run: standing(run, 3.4),
+        {"dip / size": 0.01, "sideways / size": 0.01},
+        ("pgs", "soft_step"),
+        ("soft_step",),
+        dt=0.01,
+        peers="steps until collapse (here of 6000): RaiSim 25 (10 iterations) to never (1000); Bullet 147 to 55058, "
+        "ODE 122 to 6453, MuJoCo 218 to 3297, DART 17 to 19",
     ),
     Case(
-        "B5b", "tower of 102 planks, dt 0.01", hard_scenes.kapla_tower, 60.0, lambda run: standing(run, 3.4),
-        {"dip / size": 0.01, "sideways / size": 0.01}, ("pgs", "soft_step"), dt=0.01,
-        peers="steps until collapse, of 60000: RaiSim 25 (10 iterations) to never (1000); Bullet 147 to 55058, ODE 122 to 6453, "
-        "MuJoCo 218 to 3297, DART 17 to 19",
+        "B7",
+        "chain of 10 links",
+        lambda options: hard_scenes.chain(10, options),
+        10.0,
+        lambda run: joined(run, 10),
+        {"widest gap / link": 0.01},
+        ALL,
+        ("pgs", "converged"),
+        settings=DAMPED,
     ),
     Case(
-        "B7", "chain of 10 links", lambda o: hard_scenes.chain(10, o), 10.0, lambda run: joined(run, 10),
-        {"widest gap / link": 0.01}, ALL, settings=DAMPED,
-    ),
-    *(
-        Case(
-            "B7a", f"ball of 672 links' mass on a chain of 40, dt {dt:.4f}", lambda o: hard_scenes.chain(40, o, 4021.0), 10.0,
-            lambda run: joined(run, 40), {"widest gap / link": 0.01}, tiers, dt=dt, settings=DAMPED,
-            peers="Box2D shows it off; sweeps stretch it by metres",
-        )
-        for dt, tiers in ((1 / 60, ALL), (1 / 240, ("pgs",)))
-    ),
-    Case(
-        "B7c", "hanging chain of 40 links, made twice as long", lambda o: hard_scenes.chain(40, o, level=False, spacing=2.0), 10.0,
-        lambda run: joined(run, 40), {"widest gap after 3 s / link": 0.01, "largest speed [m/s]": 30.0}, ALL, settings=DAMPED,
+        "B7a",
+        "ball of 672 links' mass on a chain of 40",
+        lambda options: hard_scenes.chain(40, options, 4021.0),
+        10.0,
+        lambda run: joined(run, 40),
+        {"widest gap / link": 0.01},
+        ALL,
+        ("pgs", "converged"),
+        settings=DAMPED,
+        peers="a showcase of Box2D; sweeps stretch it by metres",
     ),
     Case(
-        "B10a", "pyramid of overlapping cubes", hard_scenes.overlapping_pyramid, 5.0, separating,
-        {"largest speed [m/s]": 12.5}, ALL[:2], peers="largest speed: PyBullet 3.4 (1/60), 15.3 (1/240); MuJoCo 13.5, 20.8",
+        "B7c",
+        "hanging chain of 40 links, made twice as long",
+        lambda options: hard_scenes.chain(40, options, level=False, spacing=2.0),
+        10.0,
+        lambda run: joined(run, 40),
+        {"widest gap after 3 s / link": 0.01, "largest speed [m/s]": 30.0},
+        ALL,
+        ("pgs", "converged"),
+        settings=DAMPED,
     ),
     Case(
-        "B12b", "ball at 500 m/s against a stack and a wall", hard_scenes.bullet_against_stack, 2.0,
-        lambda run: passing(run, 10.0, 10.0, 20.0), {"bodies through the wall": 0.0}, ALL, settings={"continuous": True},
+        "B10a",
+        "pyramid of overlapping cubes",
+        hard_scenes.overlapping_pyramid,
+        5.0,
+        separating,
+        {"largest speed [m/s]": 12.5},
+        ("pgs", "soft_step"),
+        ("pgs", "soft_step"),
+        peers="largest speed: PyBullet 3.4 (1/60), 15.3 (1/240); MuJoCo 13.5, 20.8",
+    ),
+    Case(
+        "B12b",
+        "ball at 500 m/s against a stack and a wall",
+        hard_scenes.bullet_against_stack,
+        2.0,
+        lambda run: passing(run, 10.0, 10.0, 20.0),
+        {"bodies through the wall": 0.0},
+        ALL,
+        ALL,
+        settings={"continuous": True},
         peers="PyBullet and MuJoCo pass through walls at 180 m/s and 1/60 to 1e-3 s",
     ),
-)  # fmt: skip
+)

@@ -6,6 +6,7 @@ The whole table is slow and is what the report measures; shortened runs of some 
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from tests.marks import QUICK_AND_SLOW_PRECISION
 EVERY = [
     pytest.param(case, tier, precision, id=f"{case.name}-{tier}-{precision}")
     for case in CASES
-    for tier in case.tiers
+    for tier in case.tested
     for precision in case.precisions
 ]
 BY_NAME = {case.name: case for case in CASES}
@@ -37,7 +38,7 @@ def test_gates(case, tier, precision, gate):
     ("name", "tier", "seconds"),
     [
         ("A1 balls on a board, pushed diagonally", "pgs", 0.5),
-        ("B7a ball of 672 links' mass on a chain of 40, dt 0.0167", "pgs", 3.5),
+        ("B7a ball of 672 links' mass on a chain of 40", "pgs", 3.5),
     ],
 )
 def test_gates_in_a_short_run(name, tier, seconds, gate):
@@ -68,12 +69,17 @@ def test_small_block_of_balls(precision, restitution, gate):
 
 def test_time_of_impact_of_a_bullet(precision, gate):
     """B12e: a ball of 1 m at 1e5 m/s, 998 m away from the near side of a cube of 2 m."""
-    still = (np.zeros(3), np.zeros(3))
+    still, upright = (np.zeros(3), np.zeros(3)), np.array([1.0, 0.0, 0.0, 0.0])
     found = jax.jit(
-        lambda speed: time_of_impact(
-            Sphere(1.0), (np.array([-1000.0, 0.3, 0.2]), np.array([1.0, 0, 0, 0])), (np.array([1e5, 0, 0]) * speed, still[1]),
-            Box((1.0, 1.0, 1.0)), (np.zeros(3), np.array([1.0, 0, 0, 0])), still, 1.0,
+        lambda place, velocity: time_of_impact(
+            Sphere(1.0),
+            (place, upright),
+            (velocity, still[1]),
+            Box((1.0, 1.0, 1.0)),
+            (np.zeros(3), upright),
+            still,
+            1.0,
         )
-    )(1.0)  # fmt: skip
+    )(jnp.array([-1000.0, 0.3, 0.2]), jnp.array([1e5, 0.0, 0.0]))
     assert bool(found.hit)
     gate("time / 0.00998 s - 1", float(found.time) / 0.00998 - 1, {"float32": 1e-6, "float64": 1e-9}[str(precision)])
