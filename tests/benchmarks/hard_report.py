@@ -73,7 +73,7 @@ def table(kept: dict[str, Any]) -> str:
         for tier, precision, found in rows:
             cells = [_cell(found["values"][name], case.gates.get(name)) for name in names]
             flagged = f"{tier} (flags {found['flags']})" if found["flags"] else tier
-            cost = f"{1e3 * found['cost']:.3g} | {found['compile']:.0f}"
+            cost = "- | -" if found["cost"] is None else f"{1e3 * found['cost']:.3g} | {found['compile']:.0f}"
             parts.append(f"| {flagged} | {precision} | " + " | ".join(cells) + f" | {cost} |\n")
     return "".join(parts)
 

@@ -1,4 +1,4 @@
-"""The hard scenes of the benchmark suite against their gates, by solver tier and precision (`hard_cases`).
+"""The hard scenes of the benchmark suite against their gates, by solver tier (`hard_cases`), in float32.
 
 The whole table is slow and is what the report measures; shortened runs of some cases are in the quick suite.
 """
@@ -15,18 +15,13 @@ from tests.benchmarks import hard_scenes
 from tests.benchmarks.hard_cases import CASES, energy_of_balls, overlap_of_balls, record
 from tests.marks import QUICK_AND_SLOW_PRECISION
 
-EVERY = [
-    pytest.param(case, tier, precision, id=f"{case.name}-{tier}-{precision}")
-    for case in CASES
-    for tier in case.tested
-    for precision in case.precisions
-]
+EVERY = [pytest.param(case, tier, id=f"{case.name}-{tier}") for case in CASES for tier in case.tested]
 BY_NAME = {case.name: case for case in CASES}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("case", "tier", "precision"), EVERY, indirect=["precision"])
-def test_gates(case, tier, precision, gate):
+@pytest.mark.parametrize(("case", "tier"), EVERY)
+def test_gates(case, tier, gate):
     run, flags = record(case, tier)
     values = case.measure(run)
     assert not flags & (Flag.NON_FINITE | Flag.CONTACT_OVERFLOW)
