@@ -15,7 +15,8 @@ from mathota_jax.bodies import Inertia, InverseInertia
 from mathota_jax.solver.pgs import Places
 from mathota_jax.solver.table import EMPTY, Table, TracedTable
 from mathota_jax.spatial.indexing import gather_together, take, unstack
-from mathota_jax.spatial.vector import Vec3, dot
+from mathota_jax.spatial.spread import spread
+from mathota_jax.spatial.vector import Vec3, cross, dot
 
 
 class Side(NamedTuple):
@@ -48,7 +49,8 @@ def select_blocks(table: Table | TracedTable, side: int, tree: Any, places: Plac
         assert places is not None
         return gather_columns(table, jnp.minimum(places.blocks[side], table.block_count - 1), tree)
     blocks = np.asarray(table.blocks[side], np.int32).reshape(-1)
-    return take(tree, np.minimum(blocks, table.block_count - 1))
+    chosen = take(tree, np.minimum(blocks, table.block_count - 1))
+    return jax.tree.map(lambda values: spread(values, (blocks.size, values.shape[-1])), chosen)
 
 
 def smaller_side(table: Table | TracedTable, values: Array, places: Places | None) -> Array:
@@ -78,13 +80,33 @@ def pack_sides(table: Table | TracedTable, rows: Sequence[Side], worlds: int) ->
     return jnp.stack([pack_scalars(table, row, worlds) for row in components], axis=1)
 
 
-def unpack_sides(packed: Array) -> list[Side]:
-    """One `Side` for each row, components (turn * column, world): the inverse of `pack_sides`."""
-    rows = []
-    for row in unstack(packed, 1):
-        components = [part.reshape(-1, part.shape[-1]) for part in unstack(row, 1)]
-        rows.append(Side(Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None))
-    return rows
+def pack_point_rows(
+    table: Table | TracedTable, directions: Sequence[Vec3], arm: Vec3 | None, worlds: int
+) -> Array:
+    """(turn, row, component, column, world) of the rows of one point each, along its directions and at the end of its arm.
+
+    Args:
+      directions: one for each row, components (turn * column, world).
+      arm: from the centre of mass, likewise; None where nothing couples to rotation.
+    """
+    linear = Vec3(*(pack_scalars(table, part, worlds) for part in zip(*directions, strict=True)))
+    if arm is None:
+        return jnp.stack(linear, axis=2)
+    arms = Vec3(*(spread(pack_scalars(table, [part], worlds), linear.x.shape) for part in arm))
+    return jnp.stack([*linear, *cross(arms, linear)], axis=2)
+
+
+def respond_packed(table: Table | TracedTable, jacobian: Array, inertia: InverseInertia) -> Array:
+    """`respond` of all rows of a table: (turn, row, component, column, world), as the Jacobian."""
+    components = unstack(jacobian, 2)
+    shape = components[0].shape
+
+    def of_rows(values: Array) -> Array:
+        return spread(values.reshape(shape[0], 1, shape[2], -1), shape)
+
+    side = Side(Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None)
+    response = respond(side, jax.tree.map(of_rows, inertia))
+    return jnp.stack(response.linear if response.angular is None else (*response.linear, *response.angular), axis=2)
 
 
 def pack_scalars(table: Table | TracedTable, values: Sequence[Array], worlds: int) -> Array:

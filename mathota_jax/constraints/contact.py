@@ -21,16 +21,14 @@ from jax import Array
 from mathota_jax.bodies import InverseInertia, pack_blocks, smaller_moving
 from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
-    Side,
     collect,
     gather_columns,
+    pack_point_rows,
     pack_scalars,
-    pack_sides,
-    respond,
+    respond_packed,
     select,
     select_blocks,
     smaller_side,
-    unpack_sides,
 )
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
@@ -44,7 +42,7 @@ from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.vector import Vec3, cross, dot, tangent_basis
+from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
 
 RELAXATION = 4 / 3
 """Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
@@ -153,11 +151,13 @@ def contact_rows(
         # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
         surface = chosen.position + normal * (jnp.maximum(chosen.separation, 0.0) * (0.5 * sign))
         arm = compute_once(surface - position, chosen.separation)
-        sides = [Side(direction * sign, cross(arm, direction) * sign if rotating else None) for direction in directions]
-        jacobians.append(jacobian := compute_once(pack_sides(table, sides, worlds), chosen.separation))
-        responses.append(pack_sides(table, [respond(row, inertia) for row in unpack_sides(jacobian)], worlds))
+        signed = [direction * sign for direction in directions]
+        jacobian = compute_once(pack_point_rows(table, signed, arm if rotating else None, worlds), chosen.separation)
+        jacobians.append(jacobian)
+        responses.append(respond_packed(table, jacobian, inertia))
+    # Stored for reverse mode: else their cotangents are computed again for each entry of the Jacobians.
     start, free = (
-        along.reshape(-1, along.shape[-1])
+        compute_once(along.reshape(-1, along.shape[-1]), chosen.separation)
         for along in (
             pgs.first_row_velocity(table, jacobians, places, velocity)
             for velocity in (motion.velocity, motion.free_velocity)

@@ -84,7 +84,7 @@ def rotate_at_constant_momentum(
     if inertia.rotation is None:
         rotation_vector = inertia.solve(momentum) * dt
         return normalize(multiply(exponential(rotation_vector), orientation)), rotation_vector
-    start = inertia.rotation.apply_transposed(momentum)
+    start = compute_once(inertia.rotation.apply_transposed(momentum), momentum.x)
     inverse = Vec3(1.0 / inertia.moments.x, 1.0 / inertia.moments.y, 1.0 / inertia.moments.z)
     theta = compute_once(_rotation_vector(inverse, start, dt), start.x)
     theta = _fast_rotation_vector(inverse, start, dt, theta)

@@ -27,6 +27,7 @@ from mathota_jax.solver.laws import Law
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.settle import store
+from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.struct import pytree, static
 
 UNROLLED_TURNS = 12
@@ -191,14 +192,12 @@ def _turn(
 
 def _project(jacobian: Array, velocity: Array) -> Array:
     """``J v``: (..., row, component, column, world) times (component, ..., column, world)."""
-    terms = [j * v[..., None, :, :] for j, v in zip(unstack(jacobian, -3), unstack(velocity, -3), strict=True)]
-    return functools.reduce(jnp.add, terms)
+    return add_slices(jacobian * spread(velocity[..., None, :, :, :], jacobian.shape), -3)
 
 
 def _respond(response: Array, impulse: Array, together: int) -> Array:
     """``M^-1 J^T`` times impulse, summed over the rows and columns of each constraint: (component, constraint, world)."""
-    terms = [r * i[..., None, :, :] for r, i in zip(unstack(response, -4), unstack(impulse, -3), strict=True)]
-    total = functools.reduce(jnp.add, terms)
+    total = add_slices(response * spread(impulse[..., None, :, :], response.shape), -4)
     if together == 1:
         return total
     return functools.reduce(jnp.add, unstack(total.reshape(total.shape[0], -1, together, total.shape[-1]), 2))
@@ -392,7 +391,7 @@ def _no_velocity(rows: tuple[Rows, ...]) -> Array:
 
 def _apply(matrix: Array, x: Array) -> Array:
     """(turn, row, row', ...) times (turn, row', ...)."""
-    return functools.reduce(jnp.add, [matrix[:, :, row] * x[:, None, row] for row in range(x.shape[1])])
+    return add_slices(matrix * spread(x[:, None], matrix.shape), 2)
 
 
 def _weigh(jacobian: Array, by_error: Array) -> Array:
@@ -404,7 +403,7 @@ def _weigh(jacobian: Array, by_error: Array) -> Array:
 def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...]) -> Array:
     """(turn, component, column, world) velocities of all blocks of a table side."""
     flat = [min(block, velocity.shape[1] - 1) for turn in blocks for block in turn]
-    gathered = jnp.broadcast_to(take(velocity, flat, axis=1), (velocity.shape[0], len(flat), velocity.shape[2]))
+    gathered = spread(take(velocity, flat, axis=1), (velocity.shape[0], len(flat), velocity.shape[2]))
     return jnp.moveaxis(gathered.reshape(velocity.shape[0], len(blocks), -1, velocity.shape[2]), 1, 0)
 
 

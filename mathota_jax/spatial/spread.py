@@ -1,0 +1,86 @@
+"""`spread` and `add_slices`: a broadcast and a sum along short axes, each the transpose of the other.
+
+The transpose of an ordinary broadcast is a reduction, which XLA on CPUs computes by a library call or a scalar loop: for
+the few rows and components of a constraint that takes longer than everything around it. A sum of slices is fused with
+whatever needs it, and runs side by side for all worlds. The transpose of a sum written slice by slice is a concatenation
+that branches for every element; that of `add_slices` is a broadcast.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+
+def spread(array: Array, shape: tuple[int, ...]) -> Array:
+    """Repeats an array along its axes of size 1; the last axis, that of the worlds, is left as it is.
+
+    Args:
+      array: (..., world), as many axes as `shape`.
+      shape: sizes to reach; its last entry is ignored.
+    """
+    shape = (*shape[:-1], array.shape[-1])
+    return array if array.shape == shape else _spread_p.bind(array, shape=shape)
+
+
+def add_slices(array: Array, axis: int) -> Array:
+    """Sum along a short axis, which is removed."""
+    axis %= array.ndim
+    total = array if array.shape[axis] == 1 else _add_slices_p.bind(array, axis=axis)
+    return jnp.squeeze(total, axis)
+
+
+def _broadcast(array: Array, *, shape: tuple[int, ...]) -> Array:
+    return jnp.broadcast_to(array, shape)
+
+
+def _transpose_spread(cotangent: Any, array: Any, *, shape: tuple[int, ...]) -> list[Any]:
+    if type(cotangent) is ad.Zero:
+        return [ad.Zero(array.aval)]
+    for axis, (have, want) in enumerate(zip(array.aval.shape, shape, strict=True)):
+        if have != want:
+            cotangent = _add_slices_p.bind(cotangent, axis=axis)
+    return [cotangent]
+
+
+def _batch_spread(args: tuple[Array], axes: tuple[int], *, shape: tuple[int, ...]) -> tuple[Array, int]:
+    array = jnp.moveaxis(args[0], axes[0], 0)
+    return _spread_p.bind(array, shape=(array.shape[0], *shape)), 0
+
+
+def _sum(array: Array, *, axis: int) -> Array:
+    return functools.reduce(jnp.add, jax.lax.split(array, (1,) * array.shape[axis], axis))
+
+
+def _transpose_sum(cotangent: Any, array: Any, *, axis: int) -> list[Any]:
+    if type(cotangent) is ad.Zero:
+        return [ad.Zero(array.aval)]
+    return [_spread_p.bind(cotangent, shape=array.aval.shape)]
+
+
+def _batch_sum(args: tuple[Array], axes: tuple[int], *, axis: int) -> tuple[Array, int]:
+    return _add_slices_p.bind(jnp.moveaxis(args[0], axes[0], 0), axis=axis + 1), 0
+
+
+_spread_p = Primitive("spread")
+_spread_p.def_impl(_broadcast)
+_spread_p.def_abstract_eval(lambda array, *, shape: ShapedArray(shape, array.dtype))
+ad.deflinear2(_spread_p, _transpose_spread)
+batching.primitive_batchers[_spread_p] = _batch_spread
+mlir.register_lowering(_spread_p, mlir.lower_fun(_broadcast, multiple_results=False))
+
+_add_slices_p = Primitive("add_slices")
+_add_slices_p.def_impl(_sum)
+_add_slices_p.def_abstract_eval(
+    lambda array, *, axis: ShapedArray((*array.shape[:axis], 1, *array.shape[axis + 1 :]), array.dtype)
+)
+ad.deflinear2(_add_slices_p, _transpose_sum)
+batching.primitive_batchers[_add_slices_p] = _batch_sum
+mlir.register_lowering(_add_slices_p, mlir.lower_fun(_sum, multiple_results=False))
