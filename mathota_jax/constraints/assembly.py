@@ -80,9 +80,7 @@ def pack_sides(table: Table | TracedTable, rows: Sequence[Side], worlds: int) ->
     return jnp.stack([pack_scalars(table, row, worlds) for row in components], axis=1)
 
 
-def pack_point_rows(
-    table: Table | TracedTable, directions: Sequence[Vec3], arm: Vec3 | None, worlds: int
-) -> Array:
+def pack_point_rows(table: Table | TracedTable, directions: Sequence[Vec3], arm: Vec3 | None, worlds: int) -> Array:
     """(turn, row, component, column, world) of the rows of one point each, along its directions and at the end of its arm.
 
     Args:
