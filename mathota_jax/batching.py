@@ -6,8 +6,8 @@ takes a function written for arrays with one *trailing* world axis and turns it 
 
 * batching rule moves the mapped axis to the end and calls the same function again (nested maps add further axes, which
   are merged before the call; unmapped arguments get a trailing axis of size 1, never a copy);
-* JVP is a second primitive, linear in the tangents, with the primal *inputs* as its only residuals (so reverse mode
-  stores one set of inputs per call and recomputes the rest);
+* JVP is a second primitive, linear in the tangents, with the primal *inputs* as its only residuals, and what a `Shortcut`
+  keeps of the result (so reverse mode stores one set of inputs per call and recomputes the rest);
 * transpose calls the VJP of the function, in the same layout.
 
 Both primitives carry any function, so the rules close over themselves: derivatives of any order, in any order with
@@ -34,12 +34,28 @@ Native = Callable[..., list[Array]]
 """Flat function of arrays with one trailing world axis each (of common size, or 1), hashable."""
 
 
-def batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
+@dataclasses.dataclass(frozen=True)
+class Shortcut:
+    """A cheaper way to a known result, for derivatives, which compute a function again.
+
+    Attributes:
+      keep: from the result of the function, the pytree of those arrays that make the way short. They are stored in
+        reverse mode, and count as constants: whatever the result owes them must not change its derivatives.
+      function: of what was kept and of the arguments of the function; its result and derivatives are those of the
+        function, but for round-off.
+    """
+
+    keep: Callable[[Any], Any]
+    function: Callable[..., Any]
+
+
+def batch_last(function: Callable[..., Any], shortcut: Shortcut | None = None) -> Callable[..., Any]:
     """Makes a natural-shaped function of a worlds-last one.
 
     Args:
       function: pure function of pytrees. Every array it receives has its natural axes followed by ONE world axis, whose
         size is the number of worlds or 1 (argument shared by all worlds); every array it returns likewise.
+      shortcut: how derivatives compute it again; None for as it is.
 
     Returns:
       Function of the same pytrees without the world axis. Differentiable wherever `function` is; `jax.vmap` of it runs
@@ -50,7 +66,7 @@ def batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
     def natural(*args: Any) -> Any:
         leaves, in_tree = jax.tree.flatten(args)
         leaves = [jnp.asarray(leaf) for leaf in leaves]
-        native = TreeFunction(function, in_tree)
+        native = TreeFunction(function, in_tree, shortcut)
         out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
         return jax.tree.unflatten(_out_tree(native, tuple(_signature(leaf) for leaf in leaves)), out_leaves)
 
@@ -63,9 +79,18 @@ class TreeFunction:
 
     function: Callable[..., Any]
     in_tree: Any
+    shortcut: Shortcut | None = None
 
     def __call__(self, *leaves: Array) -> list[Array]:
         return jax.tree.leaves(self.function(*jax.tree.unflatten(self.in_tree, leaves)))
+
+    def again(self, out_tree: Any, outputs: Sequence[Array]) -> tuple[TreeFunction, list[Array]]:
+        """The function by its shortcut, and the arrays that it needs before the arguments."""
+        if self.shortcut is None:
+            return self, []
+        kept = self.shortcut.keep(jax.tree.unflatten(out_tree, outputs))
+        in_tree = jax.tree.structure((kept, *jax.tree.unflatten(self.in_tree, range(self.in_tree.num_leaves))))
+        return TreeFunction(self.shortcut.function, in_tree), jax.tree.leaves(kept)
 
     def out_tree(self, shapes: Sequence[jax.ShapeDtypeStruct]) -> Any:
         """Structure of the result for arguments of the given shapes."""
@@ -207,7 +232,12 @@ def _jvp_rule(
     zeros = [ad.Zero(jax.typeof(output).to_tangent_aval()) for output in outputs]
     if not selected:
         return outputs, zeros
-    real = iter(_linear_p.bind(*primals, *selected, native=native, mask=mask, world_axes=world_axes))
+    kept = []
+    if isinstance(native, TreeFunction) and native.shortcut is not None:
+        signatures = tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in map(jax.typeof, primals))
+        native, kept = native.again(_out_tree(native, signatures), outputs)
+        kept, mask = jax.lax.stop_gradient(kept), (False,) * len(kept) + mask
+    real = iter(_linear_p.bind(*kept, *primals, *selected, native=native, mask=mask, world_axes=world_axes))
     return outputs, [next(real) if _is_real(output) else zero for output, zero in zip(outputs, zeros, strict=True)]
 
 

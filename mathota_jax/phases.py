@@ -64,30 +64,34 @@ def gravity(model: Model) -> Vec3:
 
 
 def solve_rows(
-    scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...]
+    scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...], known: bool = False
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
-    """Phase 5: velocity constraints. Also 1 for each world (world,) that was not solved; None from "pgs"."""
+    """Phase 5: velocity constraints, unless `start` is `known` to solve them.
+
+    Also 1 for each world (world,) that was not solved; None from "pgs".
+    """
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
     if problem.held is None:
-        return _sweep(scene, rows, velocity, start)
+        return _sweep(scene, rows, velocity, start, known)
     hold = functools.partial(mechanism.hold, problem.held, problem.joint_rows)
     if covers(scene):
         return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
     _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
-    velocity, impulses, failed = _sweep(scene, rows, velocity, start)
+    velocity, impulses, failed = _sweep(scene, rows, velocity, start, known)
     return *hold(velocity, impulses), failed
 
 
 def _sweep(
-    scene: Scene, rows: tuple[Rows, ...], velocity: Array, start: tuple[Array, ...]
+    scene: Scene, rows: tuple[Rows, ...], velocity: Array, start: tuple[Array, ...], known: bool
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """All rows by the solver of the scene."""
     if scene.options.solver == "converged":
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
-    return *pgs.solve(iterations, _gradient_iterations(scene, iterations), rows, velocity, start), None
+    sweeps = 0 if known else iterations
+    return *pgs.solve(sweeps, _gradient_iterations(scene, iterations), rows, velocity, start), None
 
 
 def _gradient_iterations(scene: Scene, iterations: int) -> int:

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.batching import batch_last
+from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
 from mathota_jax.constraints.lever import levers
-from mathota_jax.constraints.problem import constrain, starting_impulses
+from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
@@ -108,32 +108,35 @@ def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, St
     return jax.lax.scan(body, state, actions)
 
 
-def step_worlds_last(model: Model, state: State, action: Array) -> State:
-    """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this."""
+def step_worlds_last(model: Model, state: State, action: Array, solved: Forces | None = None) -> State:
+    """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this.
+
+    `solved` are the forces that the solver found in this very step; None if it has still to find them.
+    """
     runs = (model.dt > 0) & (model.dt < jnp.inf)
     # The program must stay finite for the derivative of the selection to be 0.
-    new = _simulate_or_rest(dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0)), state, action)
+    new = _simulate_or_rest(dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0)), state, action, solved)
     new = jax.tree.map(lambda before, after: jnp.where(runs, after, before), state, new)
     bad = jnp.where(runs | (model.dt == 0), 0, int(Flag.INVALID_TIME_STEP))
     return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype))
 
 
-def _simulate_or_rest(model: Model, state: State, action: Array) -> State:
+def _simulate_or_rest(model: Model, state: State, action: Array, solved: Forces | None) -> State:
     """`_simulate`, but for batches in which everything sleeps."""
     if not (model.scene.options.sleep and model.scene.dynamic_bodies):
-        return _simulate(model, state, action)
+        return _simulate(model, state, action, solved)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))
     return jax.lax.cond(
         sleep.all_rest(model.scene, state, action),
         lambda model, state, action: in_every_world(sleep.at_rest(state), worlds),
-        lambda model, state, action: in_every_world(_simulate(model, state, action), worlds),
+        lambda model, state, action: in_every_world(_simulate(model, state, action, None), worlds),
         model,
         state,
         action,
     )
 
 
-def _simulate(model: Model, state: State, action: Array) -> State:
+def _simulate(model: Model, state: State, action: Array, solved_before: Forces | None) -> State:
     """The phases of a step."""
     scene = model.scene
     if scene.options.impact_events and scene.restitution and scene.pair_groups:
@@ -148,12 +151,16 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     free, decay = compute_once(free_velocities(model, blocks, acting, carried, force, torque), state.position)
     problem = constrain(model, state, bodies, blocks, acting, free, carried, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
-    start = starting_impulses(model, state, problem, acting, packed)
+    known = solved_before if problem.held is None else None
+    if known is not None:
+        start = known_impulses(model, problem, known)
+    else:
+        start = starting_impulses(model, state, problem, acting, packed)
     lever, beyond, gained, failed = None, None, None, None
     if scene.options.solver == "soft_step":
         solved, gained, impulses = small_steps(model, problem, blocks, packed, start)
     else:
-        solved, impulses, failed = solve_rows(scene, problem, packed, start)
+        solved, impulses, failed = solve_rows(scene, problem, packed, start, known is not None)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, beyond, gained)
     moved, displacement = compute_once((moved, displacement), state.position)
@@ -167,4 +174,15 @@ def _simulate(model: Model, state: State, action: Array) -> State:
     return let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
 
-_batched_step = batch_last(step_worlds_last)
+def _forces(state: State) -> Forces:
+    return Forces(state.joint_force, state.contact_force)
+
+
+def _step_again(solved: Forces, model: Model, state: State, action: Array) -> State:
+    options = model.scene.options
+    # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts.
+    reusable = not (options.sleep or options.impact_events or options.solver == "soft_step")
+    return step_worlds_last(model, state, action, solved if reusable else None)
+
+
+_batched_step = batch_last(step_worlds_last, Shortcut(_forces, _step_again))

@@ -23,13 +23,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiles quickly, and keeps compiled programs between runs.
+    """Compiles quickly, for one thread, and keeps compiled programs between runs.
 
-    `make test-slow` compiles as users do. JAX writes cache entries without a lock, so parallel pytest-xdist workers get a
-    directory each.
+    `make test-slow` compiles as users do. Each worker has a core of its own. JAX writes cache entries without a lock, so
+    parallel pytest-xdist workers get a directory each.
     """
     if config.getoption("markexpr") == "not slow":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK_COMPILER}".strip()
+    os.environ.setdefault("PJRT_NPROC", "1")
     worker = os.environ.get("PYTEST_XDIST_WORKER", "main")
     cache = config.rootpath / ".pytest_cache" / "jax" / worker
     cache.mkdir(parents=True, exist_ok=True)

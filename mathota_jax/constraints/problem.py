@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia, moving, of_all_bodies
+from mathota_jax.bodies import Bodies, Inertia, moving, of_all_bodies, vector
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import (
     compact,
@@ -28,6 +28,13 @@ from mathota_jax.solver.soft_step import PositionError
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
+
+
+class Forces(NamedTuple):
+    """Mean forces of all constraints in a step, as in a `State`: (joint row, world) and (slot, 3, world)."""
+
+    joint_force: Array
+    contact_force: Array
 
 
 class Problem(NamedTuple):
@@ -125,13 +132,26 @@ def starting_impulses(
     """Impulses to start from: those of the last step where rows and features are the same (guide 12.4)."""
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
-    start = [
-        joint.joint_impulse_start(rows.table, state.joint_force, model.dt, rows.bias.shape[-1])
-        for rows in problem.joint_rows
+    if problem.contacts is None:
+        return _impulses(model, problem, state.joint_force, None)
+    force = compute_once(matched_force(model.scene, problem.contacts, problem.close, state), state.position)
+    start = _impulses(model, problem, state.joint_force, force)
+    if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
+        return warm_start.plausible(problem.rows, inertia, velocity, start)
+    return start
+
+
+def known_impulses(model: Model, problem: Problem, solved: Forces) -> tuple[Array, ...]:
+    """Impulses of this step, from its mean forces."""
+    force = None if problem.contacts is None else vector(solved.contact_force)
+    return _impulses(model, problem, solved.joint_force, force)
+
+
+def _impulses(model: Model, problem: Problem, joint_force: Array, contact_force: Vec3 | None) -> tuple[Array, ...]:
+    """Impulses (turn, row, column, world) of all groups from forces in the order of slots."""
+    impulses = [
+        joint.joint_impulse_start(rows.table, joint_force, model.dt, rows.bias.shape[-1]) for rows in problem.joint_rows
     ]
-    if problem.contacts is not None:
-        force = compute_once(matched_force(model.scene, problem.contacts, problem.close, state), state.position)
-        start += [contact.warm_start_impulse(group, force, model.dt) for group in problem.contact_rows]
-        if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
-            return warm_start.plausible(problem.rows, inertia, velocity, tuple(start))
-    return tuple(start)
+    if contact_force is not None:
+        impulses += [contact.warm_start_impulse(group, contact_force, model.dt) for group in problem.contact_rows]
+    return tuple(impulses)

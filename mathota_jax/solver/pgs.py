@@ -26,7 +26,7 @@ from jax import Array, lax
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial.indexing import take, unstack
-from mathota_jax.spatial.settle import store
+from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.struct import pytree, static
 
@@ -84,7 +84,7 @@ def solve(
     """Runs a fixed number of sweeps.
 
     Args:
-      iterations: number of sweeps.
+      iterations: number of sweeps, 0 if the impulses are known to be solved.
       gradient_iterations: number of sweeps of the linear solver behind a derivative.
       rows: groups of rows, solved in this order within a sweep.
       velocity: (component, block, world) without any constraint impulse.
@@ -94,8 +94,8 @@ def solve(
       The velocity with the impulses, and the impulses.
     """
     velocity = add_impulses(rows, velocity, impulses)
-    if not rows:
-        return velocity, impulses
+    if not rows or not iterations:
+        return compute_once((velocity, impulses), velocity)
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law for group in rows)
     return sweeps(

@@ -19,7 +19,7 @@ def measure(settings: Settings) -> dict:
 
 
 def _once(settings: Settings, count: int) -> dict:
-    return launch("compile_probe", settings, {"box_count": count})
+    return launch("compile_probe", settings, {"box_count": count}, one_core=False)
 
 
 def _summary(runs: list[dict]) -> dict:

@@ -365,7 +365,7 @@ CASES: tuple[Case, ...] = (
         lambda run: {**bearing(run, slice(2, None), 0.2), **standing(run, 0.4, 2)},
         BEARS,
         ("pgs", "soft_step", "soft_step, 16 substeps", "converged"),
-        (),
+        ("converged",),
     ),
     _stack(10, ("soft_step", "converged"), "PyBullet collapses (10 iterations), leans 0.017 (50); MuJoCo dips 0.0014"),
     _stack(20, ("soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),

@@ -20,13 +20,23 @@ class MeasurementError(RuntimeError):
     """A measurement failed or ran past its limit."""
 
 
-def launch(name: str, settings: Settings, arguments: dict[str, Any] | None = None) -> dict:
+ONE_CORE = {"PJRT_NPROC": "1"}
+"""XLA in one thread, as the other engines run: programs compiled for two are half as fast again per CPU-second."""
+
+
+def launch(name: str, settings: Settings, arguments: dict[str, Any] | None = None, one_core: bool = True) -> dict:
     """Runs `tests.benchmarks.<name>.measure(settings, **arguments)` in a fresh process.
+
+    Args:
+      name, settings, arguments: what to measure.
+      one_core: compile for one thread; otherwise for as many as there are cores, as JAX does by itself.
 
     Raises:
       MeasurementError: it failed, or took longer than `settings.timeout_seconds`.
     """
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    environment = {key: value for key, value in environment.items() if key not in ONE_CORE}
+    environment |= ONE_CORE if one_core else {}
     environment["JAX_TRACEBACK_FILTERING"] = "off"  # otherwise the last line of an error is not the error
     request = json.dumps({"name": name, "settings": dataclasses.asdict(settings), "arguments": arguments or {}})
     with tempfile.TemporaryDirectory() as folder:

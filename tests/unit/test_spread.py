@@ -1,0 +1,41 @@
+"""`spread` and `add_slices` against the ordinary broadcast and sum, and their transposes against each other."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.test_util import check_grads
+
+from mathota_jax.spatial.spread import add_slices, spread
+
+
+def product(matrix, vector):
+    batch, columns, worlds = vector.shape
+    return add_slices(matrix * spread(vector.reshape(batch, 1, columns, worlds), matrix.shape), 2)
+
+
+def arguments():
+    rng = np.random.default_rng(0)
+    return jnp.asarray(rng.normal(size=(2, 3, 4, 5))), jnp.asarray(rng.normal(size=(2, 4, 5)))
+
+
+def test_values_and_derivatives_are_those_of_einsum(float64):
+    matrix, vector = arguments()
+    np.testing.assert_allclose(product(matrix, vector), jnp.einsum("brcw,bcw->brw", matrix, vector), rtol=1e-14)
+    check_grads(product, (matrix, vector), order=2, rtol=1e-8)
+
+
+def test_under_vmap(float64):
+    matrix, vector = arguments()
+    mapped = jax.vmap(product, in_axes=(-1, -1), out_axes=-1)(matrix[..., None, :], vector[..., None, :])
+    np.testing.assert_allclose(mapped[..., 0, :], product(matrix, vector), rtol=1e-14)
+
+
+def test_worlds_are_left_alone():
+    assert spread(jnp.zeros((1, 1)), (3, 7)).shape == (3, 1)
+
+
+def test_transposes_have_no_reduction(float64):
+    matrix, vector = arguments()
+    cotangents = str(jax.make_jaxpr(lambda m, v, c: jax.vjp(product, m, v)[1](c))(matrix, vector, jnp.ones((2, 3, 5))))
+    assert "reduce_sum" not in cotangents
+    assert "add_slices" in cotangents
