@@ -28,6 +28,7 @@ test-slow: $(VENV)/test.stamp
 
 bench: $(VENV)/bench.stamp
 	$(RUN) -m tests.benchmarks
+	$(RUN) -m tests.benchmarks.work_precision
 	$(RUN) -m tests.status
 
 lint: $(VENV)/test.stamp

@@ -6,6 +6,7 @@ import collections
 import dataclasses
 from collections.abc import Iterable
 
+from mathota_jax import measured
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
@@ -21,7 +22,7 @@ def describe(model: Model) -> str:
     """What the step of a scene consists of, and what it does without.
 
     Bodies, groups of pairs with the method that tests them, contact slots, rows and turns of a sweep of the solver,
-    joints, features, broadphase with its capacities, memory of a state, and all settings.
+    joints, features, broadphase with its capacities, memory of a state, expected CPU time of a step, and all settings.
 
     Args:
       model: any model of the scene; nothing is computed.
@@ -31,7 +32,7 @@ def describe(model: Model) -> str:
     """
     scene = model.scene
     sections = [_bodies(scene), _pairs(scene), _rows(scene), _joints(scene), _features(scene)]
-    sections += [[f"memory of a state: {_state_bytes(model)} bytes a world"], _settings(model)]
+    sections += [[f"memory of a state: {_state_bytes(model)} bytes a world"], _cost(scene), _settings(model)]
     return "\n".join(line for section in sections for line in section)
 
 
@@ -117,6 +118,30 @@ def _state_bytes(model: Model) -> int:
     integers = scene.slot_count + 1 + scene.place_count
     sleep = scene.body_count * (8 * number + 1) if scene.options.sleep else 0
     return floats * number + integers * 4 + sleep
+
+
+def scene_sizes(scene: Scene) -> tuple[int, ...]:
+    """Moving bodies, contact slots and joints: what the cost of a step is taken to be linear in."""
+    return len(scene.dynamic_bodies), scene.slot_count, len(scene.joints)
+
+
+def _cost(scene: Scene) -> list[str]:
+    """Expected cost, for the measured solvers; between and beyond the measured numbers of sweeps by a straight line."""
+    options, sizes = scene.options, scene_sizes(scene)
+    setting = options.solver
+    cost = measured.expected_cost(setting, sizes)
+    if cost is None or options.impact_events or options.substeps or options.sleep or options.continuous:
+        return ["expected cost: not measured for these settings"]
+    seconds, factor = cost
+    if setting == "pgs":
+        more = measured.expected_cost("pgs, 30 sweeps", sizes)
+        if more is not None:
+            seconds = max(seconds + (more.seconds - seconds) * (options.velocity_iterations - 10) / 20, 0.25 * seconds)
+            factor = max(factor, more.factor)
+    return [
+        f"expected cost: {1e6 * seconds:.2g} CPU-microseconds a step and world of a large batch on the processor of the "
+        f"work-precision report, whose scenes it meets within a factor of {factor:.1f}"
+    ]
 
 
 def _settings(model: Model) -> list[str]:

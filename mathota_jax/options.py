@@ -6,6 +6,8 @@ import dataclasses
 import math
 from typing import Any
 
+from mathota_jax import measured
+
 BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
 
 SOLVER_CHOICES = ("pgs", "converged", "soft_step")
@@ -152,6 +154,35 @@ class Options:
         if self.broadphase not in BROADPHASE_CHOICES:
             known = ", ".join(repr(choice) for choice in BROADPHASE_CHOICES)
             raise ValueError(f"Options.broadphase must be one of {known}, got {self.broadphase!r}")
+
+    @classmethod
+    def for_error(cls, error: float, kind: str = "any", **changes: Any) -> Options:
+        """The cheapest measured settings that keep an error, without damping.
+
+        Solver, sweeps and time step come from a table (`mathota_jax/error_table.json`): those whose error was at most
+        `error` in every benchmark scene of the kind, and among them the one that cost least. It is a promise for scenes
+        like those, within a factor of two; tests/benchmarks/results/work_precision.md shows them. A frame of fixed length
+        takes ``round(frame / options.dt)`` steps: `substep`, `advance`.
+
+        Args:
+          error: relative to the scale of a scene: distance, height or speed of one moving body, edge of stacked boxes,
+            length of a chain, diameter of the bodies of a pile; between 0 and 1.
+          kind: "single": one body that flies, tumbles, slides, rolls, bounces or sticks. "stack": ten equal boxes.
+            "mass_ratio": 1000 kg on 1 kg. "chain": ten links. "pile": 27 bodies in a bin, hulls in a heap. "any": all but
+            piles.
+          **changes: other fields of `Options`.
+
+        Raises:
+          ValueError: an error or kind out of range, or no measured setting is so exact.
+        """
+        if not (_is_number(error) and 0 < error < 1):
+            raise ValueError(f"Options.for_error: error must lie between 0 and 1, got {error!r}")
+        if kind not in measured.kinds():
+            known = ", ".join(repr(name) for name in measured.kinds())
+            raise ValueError(f"Options.for_error: kind must be one of {known}, got {kind!r}")
+        choice = measured.cheapest(error, kind)
+        undamped = {"linear_damping": 0.0, "angular_damping": 0.0}
+        return cls(**{"dt": choice.dt, **undamped, **choice.options, **changes})
 
     @property
     def substep_count(self) -> int:

@@ -28,7 +28,7 @@ def save_policy(policy: Policy, directory: Path, environment_id: str, backend: s
         policy: Of either backend.
         directory: An existing folder.
         environment_id: The environment that it was trained on.
-        backend: ``sb3`` or ``jax``.
+        backend: ``sb3``, ``jax`` or ``gradient``.
     """
     policy.save(directory)
     description = {"format": 1, "environment": environment_id, "backend": backend}
@@ -55,7 +55,7 @@ def load_policy(directory: Path | str) -> tuple[str, Policy]:
         environment_id, backend = description["environment"], description["backend"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is damaged: {error!r}; train again") from error
-    if backend == "jax":
+    if backend in ("jax", "gradient"):
         from training.jax_policy import JaxPolicy
 
         return environment_id, JaxPolicy.load(directory)
@@ -66,4 +66,4 @@ def load_policy(directory: Path | str) -> tuple[str, Policy]:
         from training.sb3_policy import SB3Policy
 
         return environment_id, SB3Policy.load(directory)
-    raise ValueError(f"{path} names the unknown backend {backend!r}; known: 'jax', 'sb3'")
+    raise ValueError(f"{path} names the unknown backend {backend!r}; known: 'gradient', 'jax', 'sb3'")

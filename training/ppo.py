@@ -13,6 +13,7 @@ from jax import Array, lax
 from training.actions import ActionBounds
 from training.gae import generalized_advantages
 from training.jax_policy import JaxPolicy
+from training.learning import learn
 from training.networks import (
     Parameters,
     action_mean,
@@ -57,10 +58,6 @@ class UpdateMetrics(NamedTuple):
     value_loss: Array
     entropy: Array
     clipped_fraction: Array
-
-
-class DivergedError(FloatingPointError):
-    """The losses or the parameters are no longer finite."""
 
 
 class PPO:
@@ -247,25 +244,7 @@ def train(
     Raises:
         DivergedError: If a loss is no longer finite.
     """
-    learner = PPO(environment, hyperparameters)
-    state = learner.initial_state(seed)
-    capacity = -(-hyperparameters.update_count // hyperparameters.evaluations)
-    samples_per_update = hyperparameters.rollout_length * hyperparameters.worlds
-    for first in range(0, hyperparameters.update_count, capacity):
-        update_count = min(capacity, hyperparameters.update_count - first)
-        state, metrics = learner.run(state, update_count, capacity)
-        for index in range(update_count):
-            finished = int(metrics.finished_episodes[index])
-            mean_return = float(metrics.return_sum[index]) / max(finished, 1)
-            report((first + index + 1) * samples_per_update, mean_return, finished)
-        if not np.all(np.isfinite([metrics.policy_loss, metrics.value_loss])):
-            raise DivergedError(
-                f"training diverged before {(first + update_count) * samples_per_update} steps: a loss is not finite; "
-                "lower the learning rate, and check that the environment's observations and rewards are finite"
-            )
-        if should_stop(learner.policy(state)):
-            break
-    return learner.policy(state)
+    return learn(PPO(environment, hyperparameters), hyperparameters, seed, report, should_stop)
 
 
 def clipped_objective(ratio: Array, advantage: Array, clip_range: float) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 REQUIRED_PACKAGES = {
     "sb3": ("torch", "stable_baselines3", "matplotlib", "tqdm"),
     "jax": ("optax", "matplotlib", "tqdm"),
+    "gradient": ("optax", "matplotlib", "tqdm"),
 }
 
 

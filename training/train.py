@@ -1,4 +1,4 @@
-"""Train PPO on an environment: ``python -m training.train --env mathota/InvertedPendulum-v0``.
+"""Train a policy on an environment: ``python -m training.train --env mathota/InvertedPendulum-v0``.
 
 Writes the policy, ``metrics.json``, a learning curve (PNG) and a replay (HTML) to
 ``runs/<environment>-<backend>-<time>/``.
@@ -26,8 +26,10 @@ from training.policies import save_policy
 from training.presets import Hyperparameters, preset, require_whole_number
 from training.requirements import REQUIRED_PACKAGES, MissingExtraError, require_packages
 from training.run_folder import CURVE_FILE, METRICS_FILE, REPLAY_FILE, create_run_folder
+from training.short_horizon_presets import ShortHorizonHyperparameters, short_horizon_preset
 
-BACKENDS = ("sb3", "jax")
+BACKENDS = {"sb3": "PPO (sb3)", "jax": "PPO (jax)", "gradient": "short-horizon actor-critic"}
+"""What trains, and how its learning curve is labelled."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class Request:
 
     Attributes:
         environment_id: For example ``mathota/InvertedPendulum-v0``.
-        backend: ``sb3`` (stable-baselines3) or ``jax`` (on the device).
+        backend: ``sb3`` (PPO of stable-baselines3), ``jax`` (PPO on the device) or ``gradient`` (short-horizon actor-critic:
+            the gradient of the simulated return).
         worlds: Worlds side by side; None takes the preset's.
         steps: World-steps, all worlds together, rounded up to whole rollouts; None takes the preset's.
         seed: Of everything random, in [0, 2**31).
@@ -67,9 +70,11 @@ class Request:
         if self.target_return is not None and not math.isfinite(self.target_return):
             raise ValueError(f"target_return must be finite, got {self.target_return}")
 
-    def hyperparameters(self) -> Hyperparameters:
+    def hyperparameters(self) -> Hyperparameters | ShortHorizonHyperparameters:
         """The preset with the worlds and steps that were asked for."""
         asked = {name: getattr(self, name) for name in ("worlds", "steps") if getattr(self, name) is not None}
+        if self.backend == "gradient":
+            return replace(short_horizon_preset(self.environment_id), **asked)
         return replace(preset(self.environment_id, self.backend), **asked)
 
 
@@ -101,7 +106,7 @@ class Plan:
 
     request: Request
     environment: Any
-    hyperparameters: Hyperparameters
+    hyperparameters: Hyperparameters | ShortHorizonHyperparameters
     folder: Path
 
 
@@ -181,13 +186,16 @@ def print_result(result: Result) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m training.train", description="Train PPO on an environment of mathota_envs."
+        prog="python -m training.train", description="Train a policy on an environment of mathota_envs."
     )
     parser.add_argument("--env", required=True, metavar="ID", help="for example mathota/InvertedPendulum-v0")
     parser.add_argument("--worlds", type=int, metavar="N", help="worlds side by side (default: the preset's)")
     parser.add_argument("--steps", type=int, metavar="M", help="steps of all worlds together (default: the preset's)")
     parser.add_argument(
-        "--backend", default="sb3", help="sb3: stable-baselines3 (default); jax: everything on the device"
+        "--backend",
+        default="sb3",
+        help="sb3: PPO of stable-baselines3 (default); jax: PPO, everything on the device; gradient: short-horizon "
+        "actor-critic, which differentiates the simulation, on the device",
     )
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
     parser.add_argument("--output", type=Path, metavar="FOLDER", help="default: a new folder under runs/")
@@ -225,6 +233,10 @@ def _backend(name: str) -> Callable[..., Any]:
         from training.sb3_backend import train as train_with_sb3
 
         return train_with_sb3
+    if name == "gradient":
+        from training.short_horizon import train as train_by_gradient
+
+        return train_by_gradient
     from training.ppo import train as train_on_device
 
     return train_on_device
@@ -240,7 +252,7 @@ def _save_pictures(plan: Plan, evaluation: Evaluation, metrics: dict[str, Any]) 
         plan.folder / CURVE_FILE,
         metrics["training_curve"],
         [*metrics["training_evaluations"], final],
-        f"{name}, PPO ({plan.request.backend}), {plan.hyperparameters.worlds} worlds",
+        f"{name}, {BACKENDS[plan.request.backend]}, {plan.hyperparameters.worlds} worlds",
         plan.request.target_return,
     )
     environment, states = plan.environment, evaluation.trajectory.state

@@ -1,4 +1,4 @@
-"""Measures speed against error and writes a report: JSON with every round, Markdown and a plot."""
+"""Measures speed against error and writes a report: JSON with every round, and Markdown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import pathlib
 import platform
 import sys
 
-from tests.benchmarks import plots
 from tests.benchmarks.process import ROOT, MeasurementError, launch
 from tests.benchmarks.report import markdown
 from tests.benchmarks.settings import QUICK, Settings
@@ -24,9 +23,8 @@ MEASUREMENTS = {
     "gradient": ("gradient", {}),
     "compile_time": ("compile_time", {}),
     "accuracy": ("accuracy", {}),
-    "precision": ("precision", {}),
 }
-PACKAGES = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "brax")
+PACKAGES = ("jax", "jaxlib", "numpy", "mujoco", "mujoco-mjx", "brax", "pybullet")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -68,12 +66,9 @@ def _measure(name: str, settings: Settings) -> dict:
 
 
 def write(report: dict, output: pathlib.Path) -> None:
-    """Writes `report.json`, `report.md` and `speed_error.png`."""
+    """Writes `report.json` and `report.md`."""
     (output / "report.json").write_text(json.dumps(report, indent=1) + "\n")
     (output / "report.md").write_text(markdown(report))
-    points = report["measurements"].get("precision", {"failed": "not measured"})
-    if "failed" not in points:
-        plots.speed_error(points, output / "speed_error.png")
 
 
 def machine() -> dict:

@@ -87,13 +87,6 @@ def bounce_contestants() -> dict[str, Contestant]:
     return contestants
 
 
-def precision_runs(scene: str, dt: float) -> dict[str, SlideRun | BounceRun]:
-    """Simulations at one time step, by label."""
-    if scene == "slide":
-        return {name: SlideRun(dt, **variant) for name, variant in SLIDE_VARIANTS.items()}
-    return {f"MuJoCo, contact frequency {frequency:g}/s": BounceRun(dt, frequency) for frequency in BOUNCE_FREQUENCIES}
-
-
 class SlideRun:
     """One simulation of the cube, settled, that can be thrown again and again."""
 

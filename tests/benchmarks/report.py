@@ -32,7 +32,7 @@ def markdown(report: dict) -> str:
         result = report["measurements"].get(scene)
         if result and "failed" not in result:
             lines += ["", f"## All of {scene}", "", *_contestants(result)]
-    lines += ["", "![error against cost over time steps](speed_error.png)", ""]
+    lines += ["", "Error against cost in more scenes, with more engines: [work_precision.md](work_precision.md).", ""]
     return "\n".join(lines)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Sphere, rollout
+from mathota_jax import Plane, SceneBuilder, Sphere, rollout
 from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, G
 from tests.physics.test_billiards import two_balls
 from tests.scenes import body_on_plane, undamped
@@ -31,13 +31,14 @@ BY_Y1 = {"y": 3.144943, "vy": 1.487775, "radius": 1.194943}
 @functools.partial(jax.jit, static_argnames="count")
 def oblique_slopes(parameters, model, state, count):
     def final(p):
-        radius = jnp.full_like(model.shapes["sphere"]["radius"], p["radius"])
+        radius = model.shapes["sphere"]["radius"].at[:2].set(p["radius"])
+        masses = jnp.stack([p["m1"], p["m2"]])
         sized = dataclasses.replace(
             model,
-            mass=jnp.stack([p["m1"], p["m2"]]),
-            inertia=0.4 * jnp.stack([p["m1"], p["m2"]])[:, None] * p["radius"] ** 2 * jnp.ones((2, 3)),
+            mass=model.mass.at[:2].set(masses),
+            inertia=model.inertia.at[:2].set(0.4 * masses[:, None] * p["radius"] ** 2 * jnp.ones((2, 3))),
             restitution=jnp.full_like(model.restitution, p["restitution"]),
-            shapes={"sphere": {"radius": radius}},
+            shapes={**model.shapes, "sphere": {"radius": radius}},
             dt=jnp.full_like(model.dt, 1.0 / count),
         )
         start = dataclasses.replace(
@@ -57,6 +58,25 @@ def test_oblique_collision(float64, count, gate):
     for (body, axis), truth in {(1, 1): BY_Y2, (1, 0): BY_X2, (0, 1): BY_Y1}.items():
         for name, value in truth.items():
             gate(f"d position[{body}, {axis}] / d {name}", float(slopes[name][body, axis]) - value, 2e-6)
+
+
+@pytest.mark.slow
+def test_oblique_collision_beside_others(precision, gate):
+    """With a sphere that touches a plane, and pairs that never meet."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    surface = {"restitution": 0.9, "friction": 0.0}
+    builder.add_body(Sphere(0.2), mass=1.0, velocity=(2.0, 0.0, 0.0), **surface)
+    builder.add_body(Sphere(0.2), mass=2.0, position=(1.0, 0.2, 0.0), **surface)
+    builder.add_body(Plane((0, 1, 0), -30.0), static=True, **surface)
+    builder.add_body(Sphere(0.1), mass=1.0, position=(0.0, -29.9, 20.0), **surface)
+    model, state = builder.build(undamped(impact_events=1))
+    slopes = oblique_slopes({k: jnp.asarray(v) for k, v in OBLIQUE.items()}, model, state, 1)
+    limit = {"float32": 1e-2, "float64": 1e-3}[str(precision)]
+    for (body, axis), truth in {(1, 1): BY_Y2, (1, 0): BY_X2, (0, 1): BY_Y1}.items():
+        for name, value in truth.items():
+            gate(
+                f"d position[{body}, {axis}] / d {name} / truth - 1", float(slopes[name][body, axis]) / value - 1, limit
+            )
 
 
 @functools.partial(jax.jit, static_argnames="count")

@@ -9,9 +9,10 @@ import scipy.stats
 
 from tests.training.toy_environments import ConstantReward, MatchTarget
 from training.evaluate import evaluate
+from training.learning import DivergedError
 from training.networks import entropy, log_probability, state_value
 from training.normalization import normalize
-from training.ppo import PPO, DivergedError, clipped_objective, train
+from training.ppo import PPO, clipped_objective, train
 from training.presets import Hyperparameters
 
 SMALL = Hyperparameters(

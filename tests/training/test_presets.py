@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from training.presets import PRESETS, Hyperparameters, preset
+from training.short_horizon_presets import SHORT_HORIZON_PRESETS, ShortHorizonHyperparameters, short_horizon_preset
 
 
 @pytest.mark.parametrize("worlds", [1, 3, 32, 100, 5000])
@@ -40,3 +41,23 @@ def test_presets_name_known_environments_and_backends():
         PRESETS
     )
     assert preset("somebody/Else-v0", "jax") == Hyperparameters()
+    assert set(SHORT_HORIZON_PRESETS) == set(registration.ENVIRONMENTS)
+    assert short_horizon_preset("somebody/Else-v0") == ShortHorizonHyperparameters()
+
+
+@pytest.mark.parametrize("worlds", [1, 3, 64])
+def test_short_horizons_are_whole(worlds):
+    hyperparameters = ShortHorizonHyperparameters(worlds=worlds, steps=10_000)
+    samples = hyperparameters.rollout_length * worlds
+    assert samples % hyperparameters.minibatch_count == 0
+    assert hyperparameters.horizon <= hyperparameters.rollout_length < hyperparameters.horizon + 4
+    assert hyperparameters.update_count * samples >= 10_000 > (hyperparameters.update_count - 1) * samples
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("horizon", 0), ("discount", 1.0), ("trace_decay", 1.1), ("target_decay", -0.1), ("maximum_state_norm", 0.0)],
+)
+def test_impossible_short_horizons_are_named(name, value):
+    with pytest.raises(ValueError, match=name):
+        replace(ShortHorizonHyperparameters(), **{name: value})

@@ -19,7 +19,7 @@ ENVIRONMENT_ID = "mathota/InvertedPendulum-v0"
         (["--env", ENVIRONMENT_ID, "--eval-episodes", "0"], "evaluation_episodes must be"),
         (["--env", ENVIRONMENT_ID, "--seed", "-1"], "seed must be"),
         (["--env", ENVIRONMENT_ID, "--seed", str(2**31)], "seed must be less than 2\\*\\*31"),
-        (["--env", ENVIRONMENT_ID, "--backend", "tensorflow"], "backend must be one of sb3, jax"),
+        (["--env", ENVIRONMENT_ID, "--backend", "tensorflow"], "backend must be one of sb3, jax, gradient"),
         (["--env", ENVIRONMENT_ID, "--target-return", "nan"], "target_return must be finite"),
     ],
 )
@@ -32,7 +32,9 @@ def test_bad_input(arguments, message, capsys, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir()), "nothing may be written before the input is checked"
 
 
-@pytest.mark.parametrize(("backend", "package"), [("sb3", "stable_baselines3"), ("jax", "optax")])
+@pytest.mark.parametrize(
+    ("backend", "package"), [("sb3", "stable_baselines3"), ("jax", "optax"), ("gradient", "optax")]
+)
 def test_missing_extra(backend, package, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, package, None)
     assert train.main(["--env", ENVIRONMENT_ID, "--backend", backend]) == 2
@@ -47,7 +49,10 @@ def test_earlier_runs_are_not_overwritten(tmp_path, capsys):
     assert (tmp_path / "metrics.json").read_text() == "{}"
 
 
-@pytest.mark.parametrize("backend", ["sb3", "jax"])
+@pytest.mark.parametrize(
+    "backend",
+    ["sb3", "jax", pytest.param("gradient", marks=pytest.mark.slow)],  # reverse mode compiles for two minutes
+)
 def test_short_run_writes_everything(backend, tmp_path, capsys):
     folder = tmp_path / "run"
     sizes = ["--worlds", "4", "--steps", "240", "--eval-episodes", "2"]
@@ -55,7 +60,7 @@ def test_short_run_writes_everything(backend, tmp_path, capsys):
     assert train.main(arguments) == 0
     printed = capsys.readouterr().out
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["steps"] == 240
+    assert metrics["steps"] == (320 if backend == "gradient" else 240)  # whole rollouts: 5 of 64 steps
     assert metrics["evaluation"]["episodes"] == 2
     assert 1 <= metrics["evaluation"]["mean_return"] <= 1000
     assert metrics["evaluation"]["mean_length"] >= metrics["evaluation"]["mean_return"]

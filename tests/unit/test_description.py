@@ -71,3 +71,19 @@ def test_memory_is_that_of_the_state(precision, options):
 
 def test_the_present_time_step_is_shown():
     assert "dt=0.25" in lines(with_dt(sphere_on_plane()[0], 0.25))["settings"]
+
+
+def test_expected_cost():
+    def cost(**options):
+        found = lines(sphere_on_plane(options=undamped(**options))[0])["expected cost"]
+        return float(found.split()[0]) if found[0].isdigit() else None
+
+    ten, twenty = cost(), cost(velocity_iterations=20)
+    assert 0 < ten <= twenty < 1e3
+    assert cost(solver="converged") > ten
+    assert cost(solver="soft_step", substeps=8) is None and cost(sleep=True) is None
+
+
+def test_a_larger_scene_is_expected_to_cost_more():
+    few, many = (float(lines(workshop(spheres=count)[0])["expected cost"].split()[0]) for count in (1, 6))
+    assert few < many
