@@ -10,7 +10,7 @@ import numpy as np
 
 from mathota_jax import Hinge, Options, SceneBuilder, Sphere
 from tests.benchmarks.ours import batched_step, repeat
-from tests.benchmarks.solver_tiers import TIERS
+from tests.benchmarks.hard_cases import TIERS
 from tests.benchmarks.work_precision.jax_program import JaxProgram
 from tests.benchmarks.work_precision.scenes import TIGHT, Scene, start_of
 from tests.benchmarks.work_precision.worlds import Motion, World
