@@ -54,7 +54,7 @@ class Options:
         chains (ten links open by 1.4 %, "pgs" 1 %), and a load sinks into what it rests on by
         ``load / (2 effective mass * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`,
         `baumgarte` and `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its
-        restitution pass. All figures: tests/benchmarks/results/solver_tiers.md.
+        restitution pass. All figures: docs/solvers.md.
       exact_joints: joints that form a tree of three or more are solved together, exactly, and closed at the end of the step
         (not with "soft_step" or `impact_events`); joints of closed loops, and one or two alone, are left to the solver. Off:
         absent.

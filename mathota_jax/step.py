@@ -156,13 +156,13 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Forces |
         start = known_impulses(model, problem, known)
     else:
         start = starting_impulses(model, state, problem, acting, packed)
-    lever, gained, failed = None, None, None
+    lever, beyond, gained, failed = None, None, None, None
     if scene.options.solver == "soft_step":
         solved, gained, impulses = small_steps(model, problem, blocks, packed, start)
     else:
         solved, impulses, failed = solve_rows(scene, problem, packed, start, known is not None)
-        lever = levers(model.dt, problem.joint_rows, problem.contact_rows, impulses, solved)
-    moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, gained)
+        lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
+    moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, beyond, gained)
     moved, displacement = compute_once((moved, displacement), state.position)
     if scene.options.solver != "soft_step":
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)

@@ -14,6 +14,7 @@ from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sid
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
+from mathota_jax.constraints.mechanism_layout import layout
 from mathota_jax.constraints.row_coefficients import Coefficients
 from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
 from mathota_jax.model import Model
@@ -50,6 +51,9 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
     slots = np.maximum(table.order, 0)
     laws, curved, angular = (values[slots] for values in (motion.start.laws, motion.start.curved, motion.start.angular))
     error, rate, coefficients = select(table, (motion.start.error, motion.start.rate, motion.coefficients))
+    if (mechanisms := layout(scene)) is not None and scene.options.position_iterations:
+        # They are closed at the end of each step; an error turned into velocity would whip a chain that starts open.
+        error = jnp.where(np.isin(slots, mechanisms.slots)[:, None], 0.0, error)
     columns = Columns(mass, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
     found = {law: LAWS[law](columns) for law in sorted(set(laws.tolist()))}
 

@@ -2,50 +2,104 @@
 
 from __future__ import annotations
 
+import collections
+import functools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.pgs import Rows
+from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.vector import Vec3, dot
+
+
+@functools.cache
+def _several_pairs(scene: Scene) -> bool:
+    """Whether some body may touch more than one other shape."""
+    if scene.broadphase is not None:
+        return True
+    pairs = collections.Counter(
+        body for group in scene.pair_groups for side in (group.bodies_a, group.bodies_b) for body in side
+    )
+    return any(pairs[body] > 1 for body in scene.dynamic_bodies)
 
 
 def levers(
+    scene: Scene,
     dt: Array,
     joint_rows: Sequence[Rows],
     contact_rows: Sequence[ContactRows],
     impulses: Sequence[Array],
-    velocity: Array,
-) -> Array:
-    """Time (block, world) that the velocity change by the constraints had to act on the position of each body.
+    free: Array,
+    solved: Array,
+) -> tuple[Array, Vec3 | None]:
+    """Time that the velocity change by the constraints had to act on the position of each body.
 
     A joint holds for the whole step (on average dt/2), a contact as long as it lasts. A body takes the mean of its rows,
-    weighted by their impulses: with a lever for each row, the large opposite impulses on a light body below a heavy one
-    would not cancel, and throw it out.
+    weighted by their impulses. Where it may touch several others, it also moves by what each impulse does beyond that mean
+    with its own lever, as far as the impulses do not cancel: a ball that flies into a corner leaves each wall at its own
+    time, but the large opposite impulses on a light body below a heavy one do not throw it out. Rotation keeps to the mean.
 
     Args:
+      scene: static scene.
       dt: time step.
       joint_rows, contact_rows: all groups.
       impulses: solved, those of the joints first, for each group (turn, row, column, world).
-      velocity: (component, block, world), for its shape.
+      free, solved: (component, block, world) velocities without and with them.
+
+    Returns:
+      The mean lever (block, world), and the displacement beyond it; None where no body touches several others.
     """
     half = 0.5 * dt
     if not contact_rows:
-        return half * jnp.ones_like(velocity[0])
+        return half * jnp.ones_like(solved[0]), None
+    several = _several_pairs(scene)
     count = len(joint_rows)
-    total = jnp.zeros((2, *velocity.shape[1:]), velocity.dtype)
+    total = jnp.zeros((6 if several else 2, *solved.shape[1:]), solved.dtype)
     for group, impulse in zip(joint_rows, impulses[:count], strict=True):
         # The linear part of the Jacobian makes a weight [N s] of the impulse, 0 for a row that only turns.
-        weights = (safe_sqrt((side[:, :, :3] ** 2).sum(2, keepdims=True)) for side in group.jacobian)
-        total = pgs.add_scaled(group, tuple(_weighted(weight, half) for weight in weights), total, jnp.abs(impulse))
+        weights = [safe_sqrt((side[:, :, :3] ** 2).sum(2, keepdims=True)) for side in group.jacobian]
+        parts = [_weighted(weight, half) for weight in weights]
+        if several:
+            parts = [_with_movement(part, side, impulse, 0.0) for part, side in zip(parts, group.response, strict=True)]
+        total = pgs.add_scaled(group, tuple(parts), total, jnp.abs(impulse))
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
         lever = group.lever[:, :, None]
         share = _weighted(jnp.ones_like(lever), lever)
-        total = pgs.add_scaled(group.rows, (share,) * len(group.rows.jacobian), total, impulse[:, :1])
-    return jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
+        if several:
+            none = [jnp.zeros_like(share)] * (impulse.shape[1] - 1)
+            share = jnp.concatenate([share, *none], axis=1)
+            # Relative to half the step, contacts at rest add nothing at all.
+            parts = tuple(_with_movement(share, side, impulse, lever - half) for side in group.rows.response)
+            total = pgs.add_scaled(group.rows, parts, total, impulse)
+        else:
+            total = pgs.add_scaled(group.rows, (share,) * len(group.rows.jacobian), total, impulse[:, :1])
+    mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
+    return mean, _beyond(total[2:], mean - half, solved - free) if several else None
+
+
+def _beyond(total: Array, mean: Array, change: Array) -> Vec3:
+    """What impulses with levers of their own move bodies more than with the mean one; levers relative to half the step.
+
+    The share that is taken rises smoothly from 0 where the velocity changes cancel to 1 where they are at right angles,
+    which is where each impulse is that of its own impact; at a smaller angle they are parts of the same.
+    """
+    squares, *moved = unstack(total, 0)
+    velocity = Vec3(*unstack(change[:3], 0))
+    kept = jnp.minimum(safe_divide(dot(velocity, velocity), squares), 1.0)
+    return (Vec3(*moved) - velocity * mean) * (kept * kept * (3.0 - 2.0 * kept))
+
+
+def _with_movement(share: Array, response: Array, impulse: Array, lever: Array | float) -> Array:
+    """Appends to what a unit of impulse adds its squared change of the velocity, and the change times the lever."""
+    linear = response[:, :, :3]
+    squared = (linear**2).sum(2, keepdims=True) * jnp.abs(impulse)[:, :, None]
+    return jnp.concatenate([share, squared, linear * lever], axis=2)
 
 
 def _weighted(weight: Array, lever: Array) -> Array:

@@ -24,6 +24,7 @@ def advance(
     solved: Array,
     lever: Array | None,
     dt: Array,
+    beyond: Vec3 | None = None,
     gained: Array | None = None,
 ) -> tuple[Bodies, tuple[Vec3, Vec3]]:
     """Moves the bodies through one step (guide 11.1, phase 6).
@@ -40,6 +41,7 @@ def advance(
       solved: (component, block, world) velocities with all constraint impulses.
       lever: (block, world) time [s] that the velocity change by the constraints had to act on the position.
       dt: time step.
+      beyond: what they move the bodies more than that.
       gained: (component, block, world) displacement by the constraints where it is known itself, in place of the lever.
 
     Returns:
@@ -51,6 +53,8 @@ def advance(
     if gained_linear is None:
         assert lever is not None
         gained_linear = (solved_linear - free_linear) * lever
+        if beyond is not None:
+            gained_linear = gained_linear + beyond
     shift = (bodies.velocity + free_linear) * (0.5 * dt) + gained_linear
     start = inertia.apply(bodies.angular_velocity)
     end = (start + torque * dt) * decay

@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mathota_jax import Hinge, Options, SceneBuilder, Sphere
+from tests.benchmarks.hard_cases import TIERS
 from tests.benchmarks.ours import batched_step, repeat
-from tests.benchmarks.solver_tiers import TIERS
 from tests.benchmarks.work_precision.jax_program import JaxProgram
 from tests.benchmarks.work_precision.scenes import TIGHT, Scene, start_of
 from tests.benchmarks.work_precision.worlds import Motion, World
 
-SETTINGS = {**TIERS, "pgs, split at impacts": {"impact_events": 2}}
+SETTINGS = {**TIERS, "pgs, 30 sweeps": {"velocity_iterations": 30}, "pgs, split at impacts": {"impact_events": 2}}
 DT = 1 / 240
 
 
