@@ -69,6 +69,13 @@ FEATURES = (
     Feature("chains and trees of joints solved exactly", "mathota_jax.constraints:mechanism", "physics/test_chain.py"),
     Feature("steps split at their impacts", "mathota_jax:impact_splitting", "physics/test_impact_events.py"),
     Feature("fitting parameters to recorded motion", "mathota_jax.fit:fit", "fit"),
+    Feature(
+        "gradients of long rollouts, missed contacts and expected losses",
+        "mathota_jax.gradients:long_rollout",
+        "gradients/test_long_rollout.py",
+    ),
+    Feature("policies by the gradient of the simulation", "training:short_horizon", "training/test_short_horizon.py"),
+    Feature("settings by error target", "mathota_jax:measured", "physics/test_for_error.py"),
     Feature("fixed time step accumulator, interpolation", "mathota_jax:interpolate", "unit/test_time_stepping.py"),
     Feature("residuals, penetration, joint gaps, `describe`", "mathota_jax:residuals", "unit/test_residuals.py"),
     Feature("GJK, with EPA for curved shapes", "mathota_jax.collision:convex", "unit/test_convex.py"),
