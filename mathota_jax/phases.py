@@ -20,7 +20,7 @@ from mathota_jax.model import Model
 from mathota_jax.outcome import merge
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
-from mathota_jax.solver.pgs import Rows, add_impulses
+from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity
 from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
@@ -130,7 +130,7 @@ def correct_positions(
         ]
     for group in problem.contact_rows:
         known = group.rows
-        change = pgs.first_row_velocity(known.table, known.jacobian, known.places, packed)
+        change = first_row_velocity(known.table, known.jacobian, known.places, packed)
         rows.append(contact.position_rows(group, change, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Inertia, InverseInertia
-from mathota_jax.solver.pgs import Places
+from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import EMPTY, Table, TracedTable
 from mathota_jax.spatial.indexing import gather_together, take, unstack
 from mathota_jax.spatial.spread import spread

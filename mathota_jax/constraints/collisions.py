@@ -28,7 +28,7 @@ from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, row_velocity
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
@@ -69,7 +69,7 @@ def foreseen(
             found.append((none, none))
             continue
 
-        start, free = (pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, v) for v in (now, then))
+        start, free = (first_row_velocity(rows.table, rows.jacobian, rows.places, v) for v in (now, then))
         e = _restitution(model, rows, worlds)
         # One of two bodies that fall may be held: to foresee too much costs a search, too little a contact.
         gap, acceleration = jnp.maximum(group.separation, 0.0), jnp.minimum((free - start) / left, -pull)
@@ -95,7 +95,7 @@ def _restitution(model: Model, rows: Rows, worlds: int) -> Array:
 def _speeds(rows: Rows, velocity: Array) -> Array:
     """(turn, 1, column, world) sum of the speeds of both bodies along the normal of each contact, or more."""
     sides = [jnp.abs(side) for side in rows.jacobian]
-    return pgs.first_row_velocity(rows.table, sides, rows.places, jnp.abs(velocity))
+    return first_row_velocity(rows.table, sides, rows.places, jnp.abs(velocity))
 
 
 def without(rows: Rows, dropped: Array) -> Rows:
@@ -165,7 +165,7 @@ def _rounds(
         velocity, total = state
         rows, rebounds = list(held), [jnp.zeros_like(row.bias) for row in held]
         for group, e in zip(groups, bounce, strict=True):
-            speed = pgs.first_row_velocity(group.rows.table, group.rows.jacobian, None, velocity)
+            speed = first_row_velocity(group.rows.table, group.rows.jacobian, None, velocity)
             rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), e * speed, 0.0)
             # What does not bounce at all just holds: a ball rebounds from a plate that lies on the ground.
             chosen = without(group.rows, (_approach(group.rows, velocity) <= least) & (e > 0))
@@ -188,7 +188,7 @@ def _rounds(
             impulses = _without_gain(tuple(rows), velocity, stopping, full)
         else:
             impulses = with_restitution(1.0)
-        velocity = pgs.add_impulses(tuple(rows), velocity, impulses)
+        velocity = add_impulses(tuple(rows), velocity, impulses)
         return velocity, tuple(a + b for a, b in zip(total, impulses, strict=True))
 
     def approaches(velocity: Array) -> Array:
@@ -213,12 +213,12 @@ def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, f
     impact without it never does, and between the two sets of impulses the energy is a parabola.
     """
     difference = tuple(b - a for a, b in zip(stopping, full, strict=True))
-    stopped = pgs.add_impulses(rows, velocity, stopping)
-    at_end = pgs.add_impulses(rows, velocity, full)
+    stopped = add_impulses(rows, velocity, stopping)
+    at_end = add_impulses(rows, velocity, full)
     zero = jnp.zeros(velocity.shape[-1], velocity.dtype)
     lost, slope, bend = zero, zero, zero
     for group, first, more in zip(rows, stopping, difference, strict=True):
-        before, middle, after = (pgs.row_velocity(group, v) for v in (velocity, stopped, at_end))
+        before, middle, after = (row_velocity(group, v) for v in (velocity, stopped, at_end))
         lost = lost - 0.5 * (first * (before + middle)).sum((0, 1, 2))
         slope = slope + (more * middle).sum((0, 1, 2))
         bend = bend + (more * (after - middle)).sum((0, 1, 2))
@@ -231,7 +231,7 @@ def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, f
 
 def _approach(rows: Rows, velocity: Array) -> Array:
     """(turn, 1, column, world) speed at which each contact approaches; 0 where there is none."""
-    speed = -pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
+    speed = -first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
     return jnp.where(contact.normal_mass(rows) > 0, jnp.maximum(speed, 0.0), 0.0)
 
 
@@ -274,6 +274,6 @@ def _held(model: Model, joints: JointRows, inertia: Inertia, velocity: Array) ->
         one_sided = select(table, jnp.broadcast_to(jnp.asarray(stops), joints.error.shape))
         worlds = rows.bias.shape[-1]
         one_sided = pack_scalars(table, [one_sided.astype(velocity.dtype)], worlds) > 0.5
-        rate = pgs.row_velocity(rows, velocity)
+        rate = row_velocity(rows, velocity)
         found.append(dataclasses.replace(rows, bias=jnp.where(one_sided, rows.bias, -rate)))
     return tuple(found)

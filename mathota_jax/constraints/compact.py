@@ -23,7 +23,7 @@ from mathota_jax.constraints.warm_start import matched_points
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours
-from mathota_jax.solver.pgs import Places
+from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import gather, take

@@ -33,10 +33,9 @@ from mathota_jax.constraints.assembly import (
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
 from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.pgs import Places, Rows
+from mathota_jax.solver.rows import Places, Rows, first_row_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
@@ -159,7 +158,7 @@ def contact_rows(
     start, free = (
         compute_once(along.reshape(-1, along.shape[-1]), chosen.separation)
         for along in (
-            pgs.first_row_velocity(table, jacobians, places, velocity)
+            first_row_velocity(table, jacobians, places, velocity)
             for velocity in (motion.velocity, motion.free_velocity)
         )
     )

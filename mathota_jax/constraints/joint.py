@@ -20,7 +20,7 @@ from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Table
 from mathota_jax.spatial.vector import where
 

@@ -11,8 +11,7 @@ from jax import Array
 
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows, add_scaled
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.vector import Vec3, dot
@@ -67,7 +66,7 @@ def levers(
         parts = [_weighted(weight, half) for weight in weights]
         if several:
             parts = [_with_movement(part, side, impulse, 0.0) for part, side in zip(parts, group.response, strict=True)]
-        total = pgs.add_scaled(group, tuple(parts), total, jnp.abs(impulse))
+        total = add_scaled(group, tuple(parts), total, jnp.abs(impulse))
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
         lever = group.lever[:, :, None]
         share = _weighted(jnp.ones_like(lever), lever)
@@ -76,9 +75,9 @@ def levers(
             share = jnp.concatenate([share, *none], axis=1)
             # Relative to half the step, contacts at rest add nothing at all.
             parts = tuple(_with_movement(share, side, impulse, lever - half) for side in group.rows.response)
-            total = pgs.add_scaled(group.rows, parts, total, impulse)
+            total = add_scaled(group.rows, parts, total, impulse)
         else:
-            total = pgs.add_scaled(group.rows, (share,) * len(group.rows.jacobian), total, impulse[:, :1])
+            total = add_scaled(group.rows, (share,) * len(group.rows.jacobian), total, impulse[:, :1])
     mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
     return mean, _beyond(total[2:], mean - half, solved - free) if several else None
 

@@ -24,7 +24,7 @@ from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import Layout, layout
 from mathota_jax.scene import Scene
 from mathota_jax.solver import tree
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide

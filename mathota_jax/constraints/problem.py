@@ -23,7 +23,7 @@ from mathota_jax.constraints import (
 )
 from mathota_jax.constraints.slots import find_slots, matched_force
 from mathota_jax.model import Model
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.soft_step import PositionError
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3

@@ -8,8 +8,7 @@ from jax import Array, lax
 from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.vector import Vec3
@@ -70,7 +69,7 @@ def plausible(rows: tuple[Rows, ...], inertia: Inertia, velocity: Array, start: 
       velocity: (component, block, world) without any constraint impulse.
       start: for each group (turn, row, column, world).
     """
-    change = pgs.add_impulses(rows, jnp.zeros_like(velocity), start)
+    change = add_impulses(rows, jnp.zeros_like(velocity), start)
     linear, angular = unpack_blocks(change)
     momentum = pack_blocks(linear * (1.0 / inertia.inverse_mass), None if angular is None else inertia.apply(angular))
     slope = (velocity * momentum).sum((0, 1))

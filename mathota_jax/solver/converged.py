@@ -26,8 +26,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import implicit, velocity_system
-from mathota_jax.solver.pgs import Rows, add_impulses, linearise, row_velocity
+from mathota_jax.solver.pgs import linearise
 from mathota_jax.solver.proximal import masses, slope, stiffen
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
 from mathota_jax.spatial.safe import safe_divide
 
 LIMIT = 150

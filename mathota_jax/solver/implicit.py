@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import velocity_system
-from mathota_jax.solver.pgs import Rows, add_impulses, row_velocity
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
 
 STEPS = 20
 """Proximal steps. Each leaves the share delta / (delta + s) of the error along a mode of stiffness s."""

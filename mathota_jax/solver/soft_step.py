@@ -30,7 +30,7 @@ from jax import Array, lax
 from mathota_jax.solver import pgs
 from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, row_velocity
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle
@@ -171,8 +171,8 @@ def solve(
             group,
             error,
             None if error.lever is None else _coupling(group),
-            pgs.row_velocity(group, velocity),
-            pgs.row_velocity(group, free - velocity) / dt,
+            row_velocity(group, velocity),
+            row_velocity(group, free - velocity) / dt,
         )
         for group, error in zip(rows, errors, strict=True)
     )
@@ -206,7 +206,7 @@ def solve(
         return (velocity, velocity - start, displacement, impulses, total, wanted), None
 
     zero, none = jnp.zeros_like(velocity), tuple(jnp.zeros_like(impulse) for impulse in impulses)
-    added = pgs.add_impulses(rows, zero, impulses)
+    added = add_impulses(rows, zero, impulses)
     wanted = tuple(_law_bias(group, zero, zero, jnp.zeros_like(dt), dt) for group in groups)
     carry = (zero, added, zero, impulses, none, wanted)
     # In reverse mode a substep is computed again: only what it starts from is stored.
@@ -267,7 +267,7 @@ def _rebound(
     moves = tuple(
         change * jnp.where(bounces, lever, longest) for change, (bounces, lever) in zip(changes, levers, strict=True)
     )
-    displacement = pgs.add_impulses(rows, displacement, moves)
+    displacement = add_impulses(rows, displacement, moves)
     return velocity, displacement, tuple(sum_ + change for sum_, change in zip(total, changes, strict=True))
 
 
@@ -367,7 +367,7 @@ def _rigid_law(group: _Group, carries: Array, lasting: Array | None) -> Any:
 def _first_row(group: _Group, velocity: Array) -> Array:
     """``J v`` of the first row of each constraint: (turn, 1, column, world)."""
     rows = group.rows
-    return pgs.first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
+    return first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
 
 
 def _moved(group: _Group, displacement: Array, time: Array, dt: Array) -> Array:

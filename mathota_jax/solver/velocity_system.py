@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows
 
 
 class Factor(NamedTuple):

@@ -11,7 +11,7 @@ from scipy.optimize import nnls
 from mathota_jax import Flag, Options, step
 from mathota_jax.solver import converged, pgs
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.pgs import Rows
+from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Constraint, make_tables
 from tests.scenes import box_stack, slab_on_plane, undamped
 

@@ -1,0 +1,197 @@
+"""Rows of constraints, and their products with velocities and impulses.
+
+A row has a Jacobian and a response ``M^-1 J^T`` on one or two blocks of generalized velocity (a free body is a block of 6,
+or of 3 where nothing couples to rotation), a bias, and a law.
+
+Layout: turn first, so that a turn is a contiguous slice; then row, component, column, world.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.solver.laws import Law
+from mathota_jax.solver.table import Table, TracedTable
+from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.settle import store
+from mathota_jax.spatial.spread import add_slices, spread
+from mathota_jax.struct import pytree, static
+
+UNROLLED_TURNS = 12
+"""Largest number of turns that a sweep unrolls."""
+
+MASKED_BLOCKS = 32
+"""Largest number of velocity blocks among which traced ones are selected by masks, side by side for all worlds; beyond,
+one world after the other by gather and scatter."""
+
+
+@pytree
+class Places:
+    """Where the constraints of a `TracedTable` act in this step.
+
+    Attributes:
+      blocks: for each side, (turn, constraint, world) velocity block; an empty place has block `block_count`, which does
+        not exist. No block occurs twice in a turn.
+      turns: () number of turns that hold a constraint in some world; they are the first ones. None for all turns: that
+        loop can be differentiated in reverse mode.
+    """
+
+    blocks: tuple[Array, ...]
+    turns: Array | None
+
+
+@pytree
+class Rows:
+    """Rows that a table visits.
+
+    Attributes:
+      jacobian: for each side, (turn, row, component, column, world).
+      response: for each side, ``M^-1 J^T``, same shape.
+      bias: (turn, row, column, world) constraint error at zero velocity.
+      law: coefficients with leading turn axis.
+      table: order of the sweep, a `Table` or a `TracedTable`.
+      places: what a traced table leaves open; None for a static one.
+    """
+
+    jacobian: tuple[Array, ...]
+    response: tuple[Array, ...]
+    bias: Array
+    law: Law
+    table: Any = static()
+    places: Places | None = None
+
+
+def project(jacobian: Array, velocity: Array) -> Array:
+    """``J v``: (..., row, component, column, world) times (component, ..., column, world)."""
+    return add_slices(jacobian * spread(velocity[..., None, :, :, :], jacobian.shape), -3)
+
+
+def respond(response: Array, impulse: Array, together: int) -> Array:
+    """``M^-1 J^T`` times impulse, summed over the rows and columns of each constraint: (component, constraint, world)."""
+    total = add_slices(response * spread(impulse[..., None, :, :], response.shape), -4)
+    if together == 1:
+        return total
+    return functools.reduce(jnp.add, unstack(total.reshape(total.shape[0], -1, together, total.shape[-1]), 2))
+
+
+def gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
+    """Velocities (component, column, world) of the blocks of a turn; padding reads any block (it has no impulse)."""
+    last = velocity.shape[1] - 1
+    if isinstance(blocks, jax.Array) and blocks.ndim == 2:
+        if velocity.shape[1] <= MASKED_BLOCKS:
+            parts = [jnp.where(blocks == k, part[:, None], 0.0) for k, part in enumerate(unstack(velocity, 1))]
+            chosen = _store_of_blocks(functools.reduce(jnp.add, parts), blocks)
+        else:
+            index = jnp.minimum(blocks, last)[None]
+            chosen = jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds")
+    elif isinstance(blocks, tuple):
+        chosen = take(velocity, [min(block, last) for block in blocks[::together]], axis=1)
+    else:
+        chosen = jnp.take(velocity, blocks[::together], axis=1, mode="clip")
+    return chosen if chosen.shape[1] == 1 else jnp.repeat(chosen, together, axis=1)  # one block broadcasts
+
+
+def _store_of_blocks(values: Array, blocks: Array) -> Array:
+    """`store` for (component, constraint, world), linear in the values."""
+    # Different for each component: by a divisor that they share, XLA would multiply, and copy the product.
+    numbers = jnp.arange(values.shape[0], dtype=blocks.dtype)[:, None, None]
+    return store(values, (blocks + numbers).astype(values.dtype))
+
+
+def receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
+    """Adds to each block the change by the constraint that acts on it."""
+    block_count = velocity.shape[1]
+    if isinstance(receivers, tuple):
+        if velocity.shape[1] <= MASKED_BLOCKS:
+            numbers = jnp.arange(block_count)[:, None]
+            for blocks, change in zip(receivers, changes, strict=True):
+                for block, part in zip(unstack(blocks, 0), unstack(_store_of_blocks(change, blocks), 1), strict=True):
+                    velocity = velocity + jnp.where(block == numbers, part[:, None], 0.0)
+            return velocity
+        # In a turn of places no block occurs twice, so the order in which a scatter adds does not matter.
+        lanes = jnp.arange(velocity.shape[2])
+        for blocks, change in zip(receivers, changes, strict=True):
+            velocity = velocity.at[:, blocks, lanes].add(change, mode="drop")
+        return velocity
+    if block_count == 1 and len(changes) == 1 and changes[0].shape[1] == 1:
+        return velocity + changes[0]
+    padding = jnp.zeros_like(changes[0][:, :1])
+    columns = jnp.concatenate([*changes, padding], axis=1)
+    if isinstance(receivers, jax.Array):
+        return velocity + jnp.take(columns, receivers, axis=1, mode="clip")
+    return velocity + take(columns, receivers, axis=1)  # type: ignore[arg-type]
+
+
+def row_velocity(group: Rows, velocity: Array) -> Array:
+    """``J v`` of all rows of a group: (turn, row, column, world)."""
+    return _project_blocks(group.table, group.jacobian, group.places, velocity)
+
+
+def first_row_velocity(
+    table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
+) -> Array:
+    """``J v`` of the first row of each constraint, (turn, 1, column, world); arguments as in `Rows`."""
+    return _project_blocks(table, [side[:, :1] for side in jacobian], places, velocity)
+
+
+def _project_blocks(
+    table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
+) -> Array:
+    if isinstance(table, TracedTable):
+        assert places is not None
+        gathered = [jax.vmap(lambda b: gather(velocity, b, table.together))(blocks) for blocks in places.blocks]
+    else:
+        gathered = [_all_turns(velocity, blocks) for blocks in table.blocks]
+    return functools.reduce(jnp.add, [project(j, v) for j, v in zip(jacobian, gathered, strict=True)])
+
+
+def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
+    """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
+    for group, impulse in zip(rows, impulses, strict=True):
+        velocity = add_scaled(group, group.response, velocity, impulse)
+    return velocity
+
+
+def add_scaled(group: Rows, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
+    """Adds to each block the impulses of its rows times `response`.
+
+    That is, for each side, (turn, row, component, column, world); the components may be others than those of a velocity.
+    """
+    table = group.table
+    if group.places is not None:
+        return _add_at_places(group.places, table.together, response, velocity, impulse)
+    if table.turn_count <= UNROLLED_TURNS:
+        by_turn = zip(*(unstack(side, 0) for side in response), unstack(impulse, 0), strict=True)
+        for turn, (*sides, values) in enumerate(by_turn):
+            changes = [respond(side, values, table.together) for side in sides]
+            velocity = receive(velocity, table.receivers[turn], changes)
+        return velocity
+
+    def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
+        receivers, sides, values = at_turn
+        return receive(velocity, receivers, [respond(side, values, table.together) for side in sides]), None
+
+    return lax.scan(body, velocity, (jnp.asarray(table.receivers), response, impulse))[0]
+
+
+def _add_at_places(
+    places: Places, together: int, response: tuple[Array, ...], velocity: Array, impulse: Array
+) -> Array:
+    def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
+        blocks, sides, values = at_turn
+        return receive(velocity, blocks, [respond(side, values, together) for side in sides]), None
+
+    return lax.scan(body, velocity, (places.blocks, response, impulse))[0]
+
+
+def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...]) -> Array:
+    """(turn, component, column, world) velocities of all blocks of a table side."""
+    flat = [min(block, velocity.shape[1] - 1) for turn in blocks for block in turn]
+    gathered = spread(take(velocity, flat, axis=1), (velocity.shape[0], len(flat), velocity.shape[2]))
+    return jnp.moveaxis(gathered.reshape(velocity.shape[0], len(blocks), -1, velocity.shape[2]), 1, 0)
