@@ -64,9 +64,10 @@ def levers(
         # The linear part of the Jacobian makes a weight [N s] of the impulse, 0 for a row that only turns.
         weights = [safe_sqrt((side[:, :, :3] ** 2).sum(2, keepdims=True)) for side in group.jacobian]
         parts = [_weighted(weight, half) for weight in weights]
+        size = jnp.abs(impulse)
         if several:
-            parts = [_with_movement(part, side, impulse, 0.0) for part, side in zip(parts, group.response, strict=True)]
-        total = add_scaled(group, tuple(parts), total, jnp.abs(impulse))
+            parts = [_with_movement(part, side, size, 0.0) for part, side in zip(parts, group.response, strict=True)]
+        total = add_scaled(group, tuple(parts), total, size)
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
         lever = group.lever[:, :, None]
         share = _weighted(jnp.ones_like(lever), lever)
@@ -95,9 +96,9 @@ def _beyond(total: Array, mean: Array, change: Array) -> Vec3:
 
 
 def _with_movement(share: Array, response: Array, impulse: Array, lever: Array | float) -> Array:
-    """Appends to what a unit of impulse adds its squared change of the velocity, and the change times the lever."""
+    """Appends what makes, times the same impulse, its squared change of the velocity, and the change times the lever."""
     linear = response[:, :, :3]
-    squared = (linear**2).sum(2, keepdims=True) * jnp.abs(impulse)[:, :, None]
+    squared = (linear**2).sum(2, keepdims=True) * impulse[:, :, None]
     return jnp.concatenate([share, squared, linear * lever], axis=2)
 
 

@@ -104,15 +104,18 @@ def throw_objective():
     return Objective(model, state, vector, noisy(clean_throws(), 0), NOISE, 1, SUBSTEPS, "free")
 
 
-@pytest.mark.parametrize("seed", [0, 3])
-def test_friction_restitution_mass_and_size(throw_objective, seed, gate):
-    """Each to 1 % from positions with 1 mm and orientations with 1 degree of noise, from a start 10 % to 15 % away.
+def starts_around(vector):
+    """The start and five others within a few percent of it: one alone may end in a wrong minimum."""
+    return vector.start + 0.05 * np.vstack(
+        [np.zeros(vector.start.size), np.random.default_rng(0).normal(size=(5, vector.start.size))]
+    )
 
-    From so far one start does not always do: with the noise of seeds 1 and 2 it ends in a wrong minimum, which the warning
-    about the residuals tells.
-    """
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_friction_restitution_mass_and_size(throw_objective, seed, gate):
+    """Each to 1 % from positions with 1 mm and orientations with 1 degree of noise, from starts 10 % to 15 % away."""
     data = noisy(clean_throws(), seed, with_velocity=True)
-    begin = throw_objective.vector.start[None]
+    begin = starts_around(throw_objective.vector)
     result = solve(throw_objective.with_data(data), begin, horizons=(0.3, 0.5, 0.65, 0.8, 1.0))
     for label, truth in TRUTH.items():
         gate(f"{label} / truth - 1", result[label] / truth - 1, 0.01)
@@ -130,7 +133,7 @@ def test_missing_frames(throw_objective, gate):
     position[lost], orientation[lost] = np.nan, np.nan
     orientation[:, 5:, 1] = np.nan
     data = dataclasses.replace(data, position=position, orientation=orientation)
-    begin = throw_objective.vector.start[None]
+    begin = starts_around(throw_objective.vector)
     result = solve(throw_objective.with_data(data), begin, horizons=(0.3, 0.65, 1.0), huber=3.0)
     for label, truth in TRUTH.items():
         gate(f"{label} / truth - 1", result[label] / truth - 1, 0.02)
