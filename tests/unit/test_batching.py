@@ -1,6 +1,7 @@
 """`jax.vmap(step)` and every derivative of it equal a Python loop over unbatched calls."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -82,9 +83,7 @@ def diagonal(blocks):
 def test_derivatives_against_finite_differences(float64):
     """The one truth for all derivatives: differences of unbatched calls, away from any kink."""
     batch = parameters()
-    np.testing.assert_allclose(
-        loop(jax.jacfwd(outcome), batch), finite_differences(outcome, batch), rtol=2e-6, atol=2e-7
-    )
+    np.testing.assert_allclose(jacobian_of_each(), finite_differences(outcome, batch), rtol=2e-6, atol=2e-7)
     assert np.abs(finite_differences(outcome, batch)).max() > 0.1
 
 
@@ -96,12 +95,26 @@ FIRST_ORDER = {
 }
 
 
-@pytest.mark.parametrize("name", FIRST_ORDER)
+@functools.cache
+def jacobian_of_each():
+    return loop(jax.jacfwd(outcome), parameters())
+
+
+@functools.cache
+def gradient_of_each():
+    return loop(jax.grad(cost), parameters())
+
+
+def slow_but(quick, names):
+    """All names; those that are not `quick` compile a program much like one that is."""
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("name", slow_but(("vmap(jacfwd)", "jacrev(vmap)"), FIRST_ORDER))
 def test_jacobians(float64, name):
     transform, arrange = FIRST_ORDER[name]
-    batch = parameters()
-    measured = arrange(jax.jit(transform())(batch))
-    np.testing.assert_allclose(measured, loop(jax.jacfwd(outcome), batch), rtol=1e-9, atol=1e-10)
+    measured = arrange(jax.jit(transform())(parameters()))
+    np.testing.assert_allclose(measured, jacobian_of_each(), rtol=1e-9, atol=1e-10)
 
 
 GRADIENTS = {
@@ -120,11 +133,10 @@ def scan_of_vmap(batch):
     return jnp.concatenate(leaves, axis=-1)
 
 
-@pytest.mark.parametrize("name", GRADIENTS)
+@pytest.mark.parametrize("name", slow_but(("vmap(grad(checkpoint))", "grad(scan(vmap))"), GRADIENTS))
 def test_gradients(float64, name):
-    batch = parameters()
-    measured = jax.jit(GRADIENTS[name]())(batch)
-    np.testing.assert_allclose(measured, loop(jax.grad(cost), batch), rtol=1e-9, atol=1e-10)
+    measured = jax.jit(GRADIENTS[name]())(parameters())
+    np.testing.assert_allclose(measured, gradient_of_each(), rtol=1e-9, atol=1e-10)
 
 
 @pytest.mark.slow
