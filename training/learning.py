@@ -3,7 +3,10 @@
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import Array, lax
 
 from training.jax_policy import JaxPolicy
 
@@ -26,6 +29,46 @@ class Learner(Protocol):
     def policy(self, state: Any) -> JaxPolicy:
         """The deterministic policy as it stands."""
         ...
+
+
+class BlockOfUpdates:
+    """`Learner.run` for a learner with one pure `update` of its state.
+
+    Attributes:
+        metrics: Named tuple of what an update reports, scalars.
+    """
+
+    metrics: Any
+
+    def __init__(self) -> None:
+        self._run = jax.jit(self._run_updates, static_argnums=2)
+
+    def update(self, state: Any) -> tuple[Any, Any]:
+        """The new state and the metrics of one update. Pure."""
+        raise NotImplementedError
+
+    def run(self, state: Any, update_count: int, capacity: int) -> tuple[Any, Any]:
+        """Run some updates in one call on the device.
+
+        Args:
+            state: Where to begin.
+            update_count: At most ``capacity``; changing it compiles nothing anew.
+            capacity: Room for metrics.
+
+        Returns:
+            The new state and the metrics with a leading axis of ``update_count``.
+        """
+        state, metrics = self._run(state, update_count, capacity)
+        return state, jax.tree.map(lambda values: np.asarray(values)[:update_count], metrics)
+
+    def _run_updates(self, state: Any, update_count: Array, capacity: int) -> tuple[Any, Any]:
+        def body(index: Array, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            state, recorded = carry
+            state, metrics = self.update(state)
+            return state, jax.tree.map(lambda all, one: all.at[index].set(one), recorded, metrics)
+
+        empty = self.metrics(*(jnp.zeros(capacity, jnp.float32) for _ in self.metrics._fields))
+        return lax.fori_loop(0, update_count, body, (state, empty))
 
 
 class Schedule(Protocol):

@@ -13,7 +13,7 @@ from jax import Array, lax
 from training.actions import ActionBounds
 from training.gae import generalized_advantages
 from training.jax_policy import JaxPolicy
-from training.learning import learn
+from training.learning import BlockOfUpdates, learn
 from training.networks import (
     Parameters,
     action_mean,
@@ -60,7 +60,7 @@ class UpdateMetrics(NamedTuple):
     clipped_fraction: Array
 
 
-class PPO:
+class PPO(BlockOfUpdates):
     """The learner for one functional environment.
 
     Args:
@@ -68,7 +68,10 @@ class PPO:
         hyperparameters: How to train.
     """
 
+    metrics = UpdateMetrics
+
     def __init__(self, environment: Any, hyperparameters: Hyperparameters) -> None:
+        super().__init__()
         self.environment = environment
         self.hyperparameters = hyperparameters
         self.bounds = ActionBounds.of(environment.action_space)
@@ -82,7 +85,6 @@ class PPO:
             optax.clip_by_global_norm(hyperparameters.maximum_gradient_norm),
             optax.adam(learning_rate, eps=1e-5),
         )
-        self._run = jax.jit(self._run_updates, static_argnums=2)
 
     def initial_state(self, seed: int) -> TrainingState:
         """Fresh networks and worlds."""
@@ -104,20 +106,6 @@ class PPO:
             key,
         )
 
-    def run(self, state: TrainingState, update_count: int, capacity: int) -> tuple[TrainingState, UpdateMetrics]:
-        """Run some updates in one call on the device.
-
-        Args:
-            state: Where to begin.
-            update_count: At most ``capacity``; changing it compiles nothing anew.
-            capacity: Room for metrics.
-
-        Returns:
-            The new state and the metrics with a leading axis of ``update_count``.
-        """
-        state, metrics = self._run(state, update_count, capacity)
-        return state, jax.tree.map(lambda values: np.asarray(values)[:update_count], metrics)
-
     def policy(self, state: TrainingState) -> JaxPolicy:
         """The deterministic policy as it stands, independent of the learner."""
         return JaxPolicy(
@@ -126,17 +114,6 @@ class PPO:
             np.asarray(state.moments.variance),
             self.bounds,
         )
-
-    def _run_updates(
-        self, state: TrainingState, update_count: Array, capacity: int
-    ) -> tuple[TrainingState, UpdateMetrics]:
-        def body(index: Array, carry: tuple[TrainingState, UpdateMetrics]) -> tuple[TrainingState, UpdateMetrics]:
-            state, recorded = carry
-            state, metrics = self.update(state)
-            return state, jax.tree.map(lambda all, one: all.at[index].set(one), recorded, metrics)
-
-        empty = UpdateMetrics(*(jnp.zeros(capacity, jnp.float32) for _ in UpdateMetrics._fields))
-        return lax.fori_loop(0, update_count, body, (state, empty))
 
     def update(self, state: TrainingState) -> tuple[TrainingState, UpdateMetrics]:
         """One rollout and the gradient steps on it. Pure; :meth:`run` compiles it."""

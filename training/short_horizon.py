@@ -20,7 +20,7 @@ from mathota_jax.gradients import clip_cotangent
 from training.actions import ActionBounds
 from training.gae import generalized_advantages
 from training.jax_policy import JaxPolicy
-from training.learning import learn
+from training.learning import BlockOfUpdates, learn
 from training.networks import Parameters, action_mean, initial_parameters, log_probability, state_value
 from training.normalization import RunningMoments, initial_moments, normalize, update_moments
 from training.rollouts import RunningEpisodes, Steps, collect, start_episodes
@@ -72,7 +72,7 @@ class BoundedSensitivity:
         return self.environment.step(clip_cotangent(env_state, self.largest_norm), action)
 
 
-class ShortHorizonActorCritic:
+class ShortHorizonActorCritic(BlockOfUpdates):
     """The learner for one functional environment.
 
     Args:
@@ -81,7 +81,10 @@ class ShortHorizonActorCritic:
         hyperparameters: How to train.
     """
 
+    metrics = UpdateMetrics
+
     def __init__(self, environment: Any, hyperparameters: ShortHorizonHyperparameters) -> None:
+        super().__init__()
         self.environment = BoundedSensitivity(environment, hyperparameters.maximum_state_norm)
         self.hyperparameters = hyperparameters
         self.bounds = ActionBounds.of(environment.action_space)
@@ -90,7 +93,6 @@ class ShortHorizonActorCritic:
         critic_steps = updates * hyperparameters.critic_epochs * hyperparameters.minibatch_count
         self.actor_optimizer = self._adam(hyperparameters.actor_learning_rate, updates)
         self.critic_optimizer = self._adam(hyperparameters.critic_learning_rate, critic_steps)
-        self._run = jax.jit(self._run_updates, static_argnums=2)
 
     def _adam(self, rate: float, steps: int) -> optax.GradientTransformation:
         schedule = optax.linear_schedule(rate, _FINAL_RATE * rate, steps)
@@ -121,20 +123,6 @@ class ShortHorizonActorCritic:
             key,
         )
 
-    def run(self, state: TrainingState, update_count: int, capacity: int) -> tuple[TrainingState, UpdateMetrics]:
-        """Run some updates in one call on the device.
-
-        Args:
-            state: Where to begin.
-            update_count: At most ``capacity``; changing it compiles nothing anew.
-            capacity: Room for metrics.
-
-        Returns:
-            The new state and the metrics with a leading axis of ``update_count``.
-        """
-        state, metrics = self._run(state, update_count, capacity)
-        return state, jax.tree.map(lambda values: np.asarray(values)[:update_count], metrics)
-
     def policy(self, state: TrainingState) -> JaxPolicy:
         """The deterministic policy as it stands, independent of the learner."""
         return JaxPolicy(
@@ -143,17 +131,6 @@ class ShortHorizonActorCritic:
             np.asarray(state.moments.variance),
             self.bounds,
         )
-
-    def _run_updates(
-        self, state: TrainingState, update_count: Array, capacity: int
-    ) -> tuple[TrainingState, UpdateMetrics]:
-        def body(index: Array, carry: tuple[TrainingState, UpdateMetrics]) -> tuple[TrainingState, UpdateMetrics]:
-            state, recorded = carry
-            state, metrics = self.update(state)
-            return state, jax.tree.map(lambda all, one: all.at[index].set(one), recorded, metrics)
-
-        empty = UpdateMetrics(*(jnp.zeros(capacity, jnp.float32) for _ in UpdateMetrics._fields))
-        return lax.fori_loop(0, update_count, body, (state, empty))
 
     def update(self, state: TrainingState) -> tuple[TrainingState, UpdateMetrics]:
         """One rollout, one step of the actor along its gradient, and the steps of the critic."""

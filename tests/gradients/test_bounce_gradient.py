@@ -55,18 +55,14 @@ def value_and_slopes(parameters, model, state, count):
     return jax.value_and_grad(final_height)(parameters, model, state, count)
 
 
+def parameters_of(**values):
+    """Traced parameters of a bounce: the given ones, the radius and a force in the first step."""
+    return {name: jnp.asarray(float(value)) for name, value in {**values, "radius": RADIUS, "first force": 0.0}.items()}
+
+
 def run(*, height, velocity, restitution, gravity, time, dt, solver="pgs"):
     model, state = ball(solver=solver)
-    values = {
-        "height": height,
-        "velocity": velocity,
-        "restitution": restitution,
-        "gravity": gravity,
-        "time": time,
-        "radius": RADIUS,
-        "first force": 0.0,
-    }
-    parameters = {name: jnp.asarray(float(value)) for name, value in values.items()}
+    parameters = parameters_of(height=height, velocity=velocity, restitution=restitution, gravity=gravity, time=time)
     value, slopes = value_and_slopes(parameters, model, state, round(time / dt))
     return float(value), {name: float(slope) for name, slope in slopes.items()}
 

@@ -9,7 +9,7 @@ import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, Sphere, rollout
 from tests.gradients.bystanders import add_bystanders
-from tests.gradients.test_bounce_gradient import LIMIT, RADIUS, UNDER_GRAVITY, G, check, value_and_slopes
+from tests.gradients.test_bounce_gradient import LIMIT, RADIUS, UNDER_GRAVITY, G, check, parameters_of, value_and_slopes
 from tests.gradients.test_slide_gradient import derivatives
 from tests.gradients.test_stick_slip import COUNT, THRESHOLD, push_with_slopes
 from tests.marks import QUICK_AND_SLOW_PRECISION
@@ -30,16 +30,7 @@ def crowded(shape, gravity=DOWN, friction=0.5, restitution=0.0, dt=1 / 240, **bo
 
 def bounce(height, velocity, restitution, gravity, time):
     model, state = crowded(Sphere(RADIUS), restitution=0.8, position=(0.0, 1.0, 0.0))
-    values = {
-        "height": height,
-        "velocity": velocity,
-        "restitution": restitution,
-        "gravity": gravity,
-        "time": time,
-        "radius": RADIUS,
-        "first force": 0.0,
-    }
-    parameters = {name: jnp.asarray(float(value)) for name, value in values.items()}
+    parameters = parameters_of(height=height, velocity=velocity, restitution=restitution, gravity=gravity, time=time)
     return value_and_slopes(parameters, model, state, 240)
 
 
