@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 
 from mathota_jax import Box, Plane, Sphere
-from tests.benchmarks.timing import Block
-from tests.benchmarks.work_precision.scenes import Scene, kept_steps, start_of, steps_of
-from tests.benchmarks.work_precision.worlds import Motion, stack
+from tests.benchmarks.work_precision.one_world import OneWorldProgram
+from tests.benchmarks.work_precision.scenes import Scene
+from tests.benchmarks.work_precision.worlds import Motion
 
 try:
     import pybullet
@@ -32,12 +32,11 @@ def _scalar_last(quaternion: np.ndarray) -> np.ndarray:
     return np.roll(quaternion, -1)
 
 
-class BulletProgram:
+class BulletProgram(OneWorldProgram):
     """One scene of free bodies at one profile and time step."""
 
     def __init__(self, scene: Scene, profile: str, dt: float):
-        self.scene, self.dt = scene, dt
-        self.start = start_of(scene.name, scene.worlds)
+        super().__init__(scene, dt)
         self.client = pybullet.connect(pybullet.DIRECT)
         self._call(pybullet.setGravity, *scene.world.gravity)
         self._call(pybullet.setPhysicsEngineParameter, fixedTimeStep=dt, **PROFILES[profile])
@@ -92,28 +91,6 @@ class BulletProgram:
             np.array([speed[1] for speed in speeds]),
         )
 
-    def record(self) -> Motion:
-        """Kept frames of the different worlds."""
-        worlds = []
-        for world in range(self.scene.worlds):
-            self._reset(world)
-            frames, kept = [], set(kept_steps(self.scene, self.dt).tolist())
-            for step in range(1, steps_of(self.scene, self.dt) + 1):
-                self._call(pybullet.stepSimulation)
-                if step in kept:
-                    frames.append(self._motion())
-            worlds.append(stack(frames))
-        return stack(worlds).map(lambda leaf: np.moveaxis(leaf, 0, 1))
-
-    def block(self) -> Block:
-        """Runs the whole horizon in one of the different worlds after the other."""
-        steps = steps_of(self.scene, self.dt)
-
-        def run() -> int:
-            for world in range(self.scene.worlds):
-                self._reset(world)
-                for _ in range(steps):
-                    pybullet.stepSimulation(physicsClientId=self.client)
-            return self.scene.worlds * steps
-
-        return run
+    def _advance(self, steps: int) -> None:
+        for _ in range(steps):
+            pybullet.stepSimulation(physicsClientId=self.client)

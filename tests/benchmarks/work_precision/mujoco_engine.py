@@ -14,9 +14,9 @@ import numpy as np
 
 from mathota_jax import Box, Plane, Sphere
 from tests.benchmarks import scenes as closed_forms
-from tests.benchmarks.timing import Block
-from tests.benchmarks.work_precision.scenes import Scene, kept_steps, start_of, steps_of
-from tests.benchmarks.work_precision.worlds import Body, Motion, stack
+from tests.benchmarks.work_precision.one_world import OneWorldProgram
+from tests.benchmarks.work_precision.scenes import Scene
+from tests.benchmarks.work_precision.worlds import Body, Motion
 
 try:
     import mujoco
@@ -99,14 +99,13 @@ def _element(name: str, attributes: dict[str, str]) -> str:
     return f"<{name} " + " ".join(f'{key}="{value}"' for key, value in attributes.items()) + ">"
 
 
-class MujocoProgram:
+class MujocoProgram(OneWorldProgram):
     """One scene at one profile and time step."""
 
     def __init__(self, scene: Scene, profile: str, dt: float):
-        self.scene, self.dt = scene, dt
+        super().__init__(scene, dt)
         self.model = mujoco.MjModel.from_xml_string(xml(scene, profile, dt))
         self.data = mujoco.MjData(self.model)
-        self.start = start_of(scene.name, scene.worlds)
         self.first = self.model.nbody - len(scene.world.moving)
 
     def bytes_per_world(self) -> float:
@@ -129,7 +128,7 @@ class MujocoProgram:
         """Runs a world whose first body starts with another speed along X."""
         self._reset(world)
         self.data.qvel[0] = speed
-        mujoco.mj_step(self.model, self.data, nstep=steps)
+        self._advance(steps)
 
     def _motion(self) -> Motion:
         mujoco.mj_kinematics(self.model, self.data)
@@ -141,27 +140,5 @@ class MujocoProgram:
                 mujoco.mju_rotVecQuat(spin[body], local[body].copy(), turn)
         return Motion(position, orientation, velocity.copy(), spin)
 
-    def record(self) -> Motion:
-        """Kept frames of the different worlds."""
-        worlds = []
-        for world in range(self.scene.worlds):
-            self._reset(world)
-            frames, done = [], 0
-            for step in kept_steps(self.scene, self.dt):
-                mujoco.mj_step(self.model, self.data, nstep=int(step - done))
-                frames.append(self._motion())
-                done = step
-            worlds.append(stack(frames))
-        return stack(worlds).map(lambda leaf: np.moveaxis(leaf, 0, 1))
-
-    def block(self) -> Block:
-        """Runs the whole horizon in one of the different worlds after the other."""
-        steps = steps_of(self.scene, self.dt)
-
-        def run() -> int:
-            for world in range(self.scene.worlds):
-                self._reset(world)
-                mujoco.mj_step(self.model, self.data, nstep=steps)
-            return self.scene.worlds * steps
-
-        return run
+    def _advance(self, steps: int) -> None:
+        mujoco.mj_step(self.model, self.data, nstep=steps)
