@@ -39,13 +39,14 @@ class Shortcut:
     """A cheaper way to a known result, for derivatives, which compute a function again.
 
     Attributes:
-      keep: from the result of the function, the pytree of those arrays that make the way short. They are stored in
-        reverse mode, and count as constants: whatever the result owes them must not change its derivatives.
+      keep: from the result of the function and its arguments, the pytree of those arrays of the result that make the way
+        short. They are stored in reverse mode, and count as constants: whatever the result owes them must not change its
+        derivatives.
       function: of what was kept and of the arguments of the function; its result and derivatives are those of the
         function, but for round-off.
     """
 
-    keep: Callable[[Any], Any]
+    keep: Callable[..., Any]
     function: Callable[..., Any]
 
 
@@ -84,13 +85,11 @@ class TreeFunction:
     def __call__(self, *leaves: Array) -> list[Array]:
         return jax.tree.leaves(self.function(*jax.tree.unflatten(self.in_tree, leaves)))
 
-    def again(self, out_tree: Any, outputs: Sequence[Array]) -> tuple[TreeFunction, list[Array]]:
+    def again(self, shortcut: Shortcut, result: Any, leaves: Sequence[Array]) -> tuple[TreeFunction, list[Array]]:
         """The function by its shortcut, and the arrays that it needs before the arguments."""
-        if self.shortcut is None:
-            return self, []
-        kept = self.shortcut.keep(jax.tree.unflatten(out_tree, outputs))
-        in_tree = jax.tree.structure((kept, *jax.tree.unflatten(self.in_tree, range(self.in_tree.num_leaves))))
-        return TreeFunction(self.shortcut.function, in_tree), jax.tree.leaves(kept)
+        args = jax.tree.unflatten(self.in_tree, leaves)
+        kept = shortcut.keep(result, *args)
+        return TreeFunction(shortcut.function, jax.tree.structure((kept, *args))), jax.tree.leaves(kept)
 
     def out_tree(self, shapes: Sequence[jax.ShapeDtypeStruct]) -> Any:
         """Structure of the result for arguments of the given shapes."""
@@ -186,6 +185,10 @@ def _signature(value: Any) -> Signature:
     return value.shape, value.dtype
 
 
+def _natural_signatures(avals: Sequence[Any], world_axes: int) -> tuple[Signature, ...]:
+    return tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in avals)
+
+
 def _one_world(signatures: tuple[Signature, ...]) -> list[jax.ShapeDtypeStruct]:
     return [jax.ShapeDtypeStruct((*shape, 1), dtype) for shape, dtype in signatures]
 
@@ -203,8 +206,8 @@ def _natural_outputs(native: Native, signatures: tuple[Signature, ...]) -> tuple
 
 def _abstract_evaluation(*avals: Any, native: Native, world_axes: int) -> list[Any]:
     worlds = np.broadcast_shapes(*(a.shape[a.ndim - world_axes :] for a in avals)) if world_axes else ()
-    signatures = tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in avals)
-    return [ShapedArray((*shape, *worlds), dtype) for shape, dtype in _natural_outputs(native, signatures)]
+    outputs = _natural_outputs(native, _natural_signatures(avals, world_axes))
+    return [ShapedArray((*shape, *worlds), dtype) for shape, dtype in outputs]
 
 
 @functools.lru_cache(maxsize=512)
@@ -240,8 +243,8 @@ def _jvp_rule(
         return outputs, zeros
     kept = []
     if isinstance(native, TreeFunction) and native.shortcut is not None:
-        signatures = tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in map(jax.typeof, primals))
-        native, kept = native.again(_out_tree(native, signatures), outputs)
+        out_tree = _out_tree(native, _natural_signatures(primals, world_axes))
+        native, kept = native.again(native.shortcut, jax.tree.unflatten(out_tree, outputs), primals)
         kept, mask = jax.lax.stop_gradient(kept), (False,) * len(kept) + mask
     real = iter(_linear_p.bind(*kept, *primals, *selected, native=native, mask=mask, world_axes=world_axes))
     return outputs, [next(real) if _is_real(output) else zero for output, zero in zip(outputs, zeros, strict=True)]

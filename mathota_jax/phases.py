@@ -79,7 +79,7 @@ def solve_rows(
     if covers(scene):
         return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
     _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
-    velocity, impulses, failed = _sweep(scene, rows, velocity, start, known)
+    velocity, impulses, failed = _sweep(scene, rows, velocity, start, known=False)
     return *hold(velocity, impulses), failed
 
 

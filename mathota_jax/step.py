@@ -12,6 +12,7 @@ from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
 from mathota_jax.constraints.lever import levers
+from mathota_jax.constraints.mechanism_layout import layout
 from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
@@ -136,8 +137,8 @@ def _simulate_or_rest(model: Model, state: State, action: Array, solved: Forces 
     )
 
 
-def _simulate(model: Model, state: State, action: Array, solved_before: Forces | None) -> State:
-    """The phases of a step."""
+def _simulate(model: Model, state: State, action: Array, known: Forces | None) -> State:
+    """The phases of a step; `known` are its solved forces, if they are."""
     scene = model.scene
     if scene.options.impact_events and scene.restitution and scene.pair_groups:
         return split_at_impacts(model, state, action)
@@ -151,7 +152,6 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Forces |
     free, decay = compute_once(free_velocities(model, blocks, acting, carried, force, torque), state.position)
     problem = constrain(model, state, bodies, blocks, acting, free, carried, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
-    known = solved_before if problem.held is None else None
     if known is not None:
         start = known_impulses(model, problem, known)
     else:
@@ -174,15 +174,19 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Forces |
     return let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
 
-def _forces(state: State) -> Forces:
-    return Forces(state.joint_force, state.contact_force)
-
-
-def _step_again(solved: Forces, model: Model, state: State, action: Array) -> State:
+def _reusable_forces(new: State, model: Model, state: State, action: Array) -> Forces | None:
+    """The solved forces of the step to `new`, where they are all that its solver found."""
+    del state, action
     options = model.scene.options
-    # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts.
-    reusable = not (options.sleep or options.impact_events or options.solver == "soft_step")
-    return step_worlds_last(model, state, action, solved if reusable else None)
+    # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts;
+    # mechanisms are solved directly.
+    if options.sleep or options.impact_events or options.solver == "soft_step" or layout(model.scene) is not None:
+        return None
+    return Forces(new.joint_force, new.contact_force)
 
 
-_batched_step = batch_last(step_worlds_last, Shortcut(_forces, _step_again))
+def _step_again(solved: Forces | None, model: Model, state: State, action: Array) -> State:
+    return step_worlds_last(model, state, action, solved)
+
+
+_batched_step = batch_last(step_worlds_last, Shortcut(_reusable_forces, _step_again))
