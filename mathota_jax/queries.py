@@ -17,7 +17,7 @@ from jax.core import Tracer
 
 from mathota_jax.batching import batch_last
 from mathota_jax.collision.height_grid import window_size
-from mathota_jax.collision.manifold import Manifold
+from mathota_jax.collision.manifold import Manifold, Nearest
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.geometry import SHAPES, Shape
 from mathota_jax.geometry.bounds import bounding_radius
@@ -251,17 +251,21 @@ def _placement(position: Vec3, orientation: Quaternion) -> Pose:
     return Pose(position, to_matrix(orientation))
 
 
-class _Nearest(NamedTuple):
-    separation: Array
-    normal: Vec3
-    point_a: Vec3
-    point_b: Vec3
-    converged: Array
+def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> Nearest:
+    """The closest points, in the order of the registry, components (1, world); the normal leads from A to B."""
+    key = _key(a, b)
+    swapped = key != (a.kind, b.kind)
+    first, second = ((b, pose_b), (a, pose_a)) if swapped else ((a, pose_a), (b, pose_b))
+    distance = PAIRS[key].distance
+    if distance is None:
+        found = _deepest(PAIRS[key].function(*_placed(*first), *_placed(*second)))
+    else:
+        found = distance(*_placed(*first), *_placed(*second))
+    return Nearest(found.separation, -found.normal, found.point_b, found.point_a, found.converged) if swapped else found
 
 
-def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> _Nearest:
-    """The deepest active point of the manifold, components (1, world)."""
-    found = _run_pair(a, pose_a, b, pose_b)
+def _deepest(found: Manifold) -> Nearest:
+    """The deepest active point of a manifold."""
     first, *others = found.points
     position, separation, normal = first.position, first.separation, found.normal
     for point in others:
@@ -269,20 +273,19 @@ def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> _Nearest:
         position, separation = where(nearer, point.position, position), jnp.where(nearer, point.separation, separation)
         normal = normal if point.normal is None else where(nearer, point.normal, normal)
     half = normal * (0.5 * separation)
-    converged = jnp.ones(jnp.shape(separation), bool) if found.converged is None else found.converged
-    return _Nearest(separation, normal, position - half, position + half, converged)
+    return Nearest(separation, normal, position - half, position + half, found.converged)
 
 
-def _natural(nearest: _Nearest) -> ClosestPoints:
+def _natural(nearest: Nearest) -> ClosestPoints:
     worlds = np.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(nearest)))
 
     def vector(v: Vec3) -> Array:
         return jnp.stack([jnp.broadcast_to(component, worlds)[0] for component in v])
 
     separation = jnp.broadcast_to(nearest.separation, worlds)[0]
-    converged = jnp.broadcast_to(nearest.converged, worlds)[0]
+    converged = jnp.ones(worlds, bool) if nearest.converged is None else jnp.broadcast_to(nearest.converged, worlds)
     return ClosestPoints(
-        separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b), converged
+        separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b), converged[0]
     )
 
 
@@ -390,7 +393,7 @@ def _spin(mover: _Mover, normal: Vec3) -> Array:
     return jnp.where(across > 0, across * mover.reach, 0.0)
 
 
-def _approach(a: _Mover, b: _Mover, time: Array, nearest: _Nearest) -> Array:
+def _approach(a: _Mover, b: _Mover, time: Array, nearest: Nearest) -> Array:
     """Rate of change of the separation [m/s]."""
     speeds = [
         dot(nearest.normal, m.velocity + cross(m.angular_velocity, point - (m.position + m.velocity * time)))

@@ -37,3 +37,20 @@ class Manifold(NamedTuple):
     normal: Vec3
     points: tuple[ContactPoint, ...]
     converged: Array | None = None
+
+
+class Nearest(NamedTuple):
+    """Closest points of two shapes; components of shape ``(pair, world)``.
+
+    Attributes:
+        separation: Signed gap [m], negative when overlapping.
+        normal: Unit vector from A to B, world frame.
+        point_a, point_b: World points [m] of both surfaces; ``point_b - point_a = separation * normal``.
+        converged: bool, as of `Manifold`.
+    """
+
+    separation: Array
+    normal: Vec3
+    point_a: Vec3
+    point_b: Vec3
+    converged: Array | None = None

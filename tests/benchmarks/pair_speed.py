@@ -169,6 +169,9 @@ def functions(case: Case) -> dict[str, Callable]:
             a, pose_a, b, pose_b = placed(*arguments)
             found = convex_distance(kind_a, a, pose_a, kind_b, b, pose_b)
             return found.separation, found.normal, found.point_a
+        if (distance := PAIRS[case.pair].distance) is not None:
+            found = distance(*placed(*arguments))
+            return found.separation, found.normal, found.point_a
         found = manifold(*arguments)
         active = [jnp.where(point.active, point.separation, jnp.inf) for point in found.points]
         return jnp.min(jnp.stack(jnp.broadcast_arrays(*active)), axis=0), found.normal

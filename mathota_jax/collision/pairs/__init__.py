@@ -2,8 +2,9 @@
 
 from typing import Any, NamedTuple, Protocol
 
+from mathota_jax.collision.box_distance import box_distance
 from mathota_jax.collision.convex.polytope import are_polytopes
-from mathota_jax.collision.manifold import Manifold
+from mathota_jax.collision.manifold import Manifold, Nearest
 from mathota_jax.collision.pairs.box_box import box_box
 from mathota_jax.collision.pairs.capsule_box import capsule_box
 from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule
@@ -33,6 +34,14 @@ class PairFunction(Protocol):
         ...
 
 
+class DistanceFunction(Protocol):
+    """Exact signed distance of the same shapes."""
+
+    def __call__(self, a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose, /) -> Nearest:
+        """Returns the closest points."""
+        ...
+
+
 CONVEX = ("capsule", "box", "cylinder", "cone", "polyhedron")
 """Kinds that meet each other by their support functions where no closed form is registered."""
 
@@ -46,11 +55,15 @@ LOCAL_CELLS = "faces, ridges and peaks of the cells under the body"
 
 
 class Pair(NamedTuple):
-    """How to test a pair of kinds, how many contact points the answer has, and by which method it is found."""
+    """How to test a pair of kinds, how many contact points the answer has, and by which method it is found.
+
+    `distance` is given where the deepest point of the manifold is not at the signed distance, or takes longer to find.
+    """
 
     function: PairFunction
     point_count: int
     method: str = CLOSED_FORM
+    distance: DistanceFunction | None = None
 
 
 def _convex(kind_a: str, kind_b: str) -> Pair:
@@ -73,7 +86,7 @@ PAIRS: dict[tuple[str, str], Pair] = {
     ("sphere", "polyhedron"): Pair(sphere_polyhedron, 1),
     ("capsule", "capsule"): Pair(capsule_capsule, 2),
     ("capsule", "box"): Pair(capsule_box, 2),
-    ("box", "box"): Pair(box_box, 4, SEPARATING_AXES),
+    ("box", "box"): Pair(box_box, 4, SEPARATING_AXES, box_distance),
 }
 PAIRS |= {
     (kind.name, "heightfield"): Pair(heightfield_pair(kind), HEIGHTFIELD_POINTS, LOCAL_CELLS)
