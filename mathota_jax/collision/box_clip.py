@@ -6,7 +6,7 @@ u = +-half.u, v = +-half.v`` in the plane of the incident face, which is paramet
 So a *code* (which two lines) says all about a point: the search for the four codes is not differentiated, and the
 points are computed from their codes.
 
-Twelve candidates in three groups of four, the groups stacked on a leading axis:
+Twelve candidates in three groups of four:
 0: walking inward along an edge ``alpha = +-1`` from either end, the first point inside the rectangle (a vertex or a
 crossing); 1: the same along ``beta = +-1`` (crossings only); 2: corners of the rectangle.
 """
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -33,6 +34,11 @@ MERGE_DISTANCE = 1e-4
 LEAN = 1e-5
 """Slope by which the search for the deepest point leans to one side, so that the tremor of a resting box (all depths
 equal) does not choose another corner every step. The deepest point kept is the deepest to this share of the size."""
+
+SIGNS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
+"""The four of each group."""
+CODE_BITS = 6
+"""Codes are below 36."""
 
 VERTEX, CROSSING_U, CROSSING_V = 0, 1, 2
 """What ends the walk along an edge: nothing (its own end), the line u = +-half.u, the line v = +-half.v."""
@@ -74,90 +80,89 @@ def clip_incident_face(frame: BoxFrame, size: Array) -> ClipPoint:
     )
     size = lax.stop_gradient(size)
     face = compute_once(face, frame.incident_axis)
-    candidates = _candidates(lax.stop_gradient(face), frame.edge, RECTANGLE_TOLERANCE * size)
-    candidates = [_Candidates(*compute_once((c.u, c.v, c.w, c.code), frame.incident_axis)) for c in candidates]
-    merge = MERGE_DISTANCE * size
+    packed = _search(lax.stop_gradient(face), frame.edge, size)
+    shifts = (CODE_BITS * np.arange(4, dtype=np.int32)).reshape((4,) + (1,) * packed.ndim)
+    return _point(face, ((packed >> shifts) & (2**CODE_BITS - 1)) - 1)
 
-    first = _winner([LEAN * (c.u + 0.5 * c.v) - c.w for c in candidates], candidates, float(jnp.finfo(size.dtype).min))
-    u0, v0 = _coordinates(first, candidates)
-    distances = [(c.u - u0) ** 2 + (c.v - v0) ** 2 for c in candidates]
+
+def _search(face: _Face, edge: Array, size: Array) -> Array:
+    """The codes of the four points in one number, int32: ``code + 1`` in `CODE_BITS` bits each, the first lowest.
+
+    One number is one kernel, in which no candidate is stored or computed twice; float32 holds 24 bits exactly.
+    """
+    number = size.dtype
+    candidates = _candidates(face, edge, RECTANGLE_TOLERANCE * size)
+    merge = MERGE_DISTANCE * size
+    first = _winner([LEAN * (c.u + 0.5 * c.v) - c.w for c in candidates], candidates, float(jnp.finfo(number).min))
+    distances = [(c.u - first.u) ** 2 + (c.v - first.v) ** 2 for c in candidates]
     second = _winner(distances, candidates, merge * merge)
-    u1, v1 = _coordinates(second, candidates)
-    areas = [_area(u0, v0, u1, v1, c) for c in candidates]
-    least_area = merge * jnp.maximum(jnp.abs(u1 - u0), jnp.abs(v1 - v0))
+    areas = [_area(first, second, c) for c in candidates]
+    least_area = merge * jnp.maximum(jnp.abs(second.u - first.u), jnp.abs(second.v - first.v))
     # On an edge parallel to the first two all areas are equal: lean again.
     spans = [jnp.abs(area) + LEAN * distance for area, distance in zip(areas, distances, strict=True)]
-    third = _winner(spans, candidates, jnp.where(second < 0, jnp.inf, least_area))
-    u2, v2 = _coordinates(third, candidates)
+    third = _winner(spans, candidates, jnp.where(second.code < 0, jnp.inf, least_area))
     # The fourth adds the largest triangle outside one of the three sides.
-    turn = jnp.where((u1 - u0) * (v2 - v0) - (v1 - v0) * (u2 - u0) < 0, 1.0, -1.0).astype(size.dtype)
+    turn = jnp.where(_area(first, second, third) < 0, 1.0, -1.0).astype(number)
     added = [
-        jnp.maximum(turn * area, jnp.maximum(turn * _area(u1, v1, u2, v2, c), turn * _area(u2, v2, u0, v0, c)))
+        jnp.maximum(turn * area, jnp.maximum(turn * _area(second, third, c), turn * _area(third, first, c)))
         for area, c in zip(areas, candidates, strict=True)
     ]
-    fourth = _winner(added, candidates, jnp.where(third < 0, jnp.inf, least_area))
-    return _point(face, jnp.stack([first, second, third, fourth]))
+    fourth = _winner(added, candidates, jnp.where(third.code < 0, jnp.inf, least_area))
+    winners = enumerate((first, second, third, fourth))
+    return settle_code(sum((2.0 ** (CODE_BITS * k) * (w.code + 1.0) for k, w in winners), jnp.zeros((), number)))
 
 
-class _Candidates(NamedTuple):
+class _Candidate(NamedTuple):
+    """A point of the clipped face and its code as a float, -1 where it is none."""
+
     u: Array
     v: Array
     w: Array
     code: Array
 
 
-def _signs(like: Array) -> tuple[Array, Array]:
-    """The four sign pairs on a new leading axis."""
-    shape = (4,) + (1,) * like.ndim
-    return (
-        jnp.asarray(np.array([1, -1, 1, -1]).reshape(shape), like.dtype),
-        jnp.asarray(np.array([1, 1, -1, -1]).reshape(shape), like.dtype),
-    )
-
-
-def _candidates(face: _Face, edge: Array, tolerance: Array) -> list[_Candidates]:
+def _candidates(face: _Face, edge: Array, tolerance: Array) -> list[_Candidate]:
     half_u, half_v = face.half_u + tolerance, face.half_v + tolerance
-    usable = ~edge
     return [
-        _walk(0, face.center, face.alpha, face.beta, half_u, half_v, usable),
-        _walk(1, face.center, face.beta, face.alpha, half_u, half_v, usable),
-        _corners(face, half_u, half_v, usable),
+        *_walks(0, face.center, face.alpha, face.beta, half_u, half_v, ~edge),
+        *_walks(1, face.center, face.beta, face.alpha, half_u, half_v, ~edge),
+        *_corners(face, half_u, half_v, ~edge),
     ]
 
 
-def _walk(
+def _walks(
     group: int, center: Vec3, fixed: Vec3, free: Vec3, half_u: Array, half_v: Array, usable: Array
-) -> _Candidates:
+) -> list[_Candidate]:
     """Slab clipping (Liang and Barsky 1984) of the two edges ``fixed = +-1``, entered from both ends."""
-    side, inward = _signs(center.x)
-    start = center + fixed * side
     inverse_u, inverse_v = _reciprocal(free.x, half_u), _reciprocal(free.y, half_v)
-    middle_u, middle_v = -start.x * (inward * inverse_u), -start.y * (inward * inverse_v)
     reach_u, reach_v = half_u * jnp.abs(inverse_u), half_v * jnp.abs(inverse_v)
-    enter_u, enter_v = middle_u - reach_u, middle_v - reach_v
-    enter = jnp.maximum(enter_u, enter_v)
-    leave = jnp.minimum(jnp.minimum(middle_u + reach_u, middle_v + reach_v), 1.0)
-    position = jnp.maximum(enter, -1.0)
-    valid = (position <= leave) & usable
-    if group == 1:  # the ends of these edges are the ends of the others
-        valid = valid & (enter > -1.0)
-    point = start + free * (inward * position)
-    ending = jnp.where(enter <= -1.0, VERTEX, jnp.where(enter_u > enter_v, CROSSING_U, CROSSING_V))
-    return _Candidates(point.x, point.y, point.z, jnp.where(valid, _codes(group, center.x) + 12.0 * ending, -1.0))
+    found = []
+    for index, (side, inward) in enumerate(SIGNS):
+        start = center + fixed * side
+        middle_u, middle_v = -start.x * (inward * inverse_u), -start.y * (inward * inverse_v)
+        enter_u, enter_v = middle_u - reach_u, middle_v - reach_v
+        enter = jnp.maximum(enter_u, enter_v)
+        leave = jnp.minimum(jnp.minimum(middle_u + reach_u, middle_v + reach_v), 1.0)
+        position = jnp.maximum(enter, -1.0)
+        valid = (position <= leave) & usable
+        if group == 1:  # the ends of these edges are the ends of the others
+            valid = valid & (enter > -1.0)
+        point = start + free * (inward * position)
+        ending = jnp.where(enter <= -1.0, VERTEX, jnp.where(enter_u > enter_v, CROSSING_U, CROSSING_V))
+        code = jnp.where(valid, 4 * group + index + 12.0 * ending, -1.0).astype(center.x.dtype)
+        found.append(_Candidate(point.x, point.y, point.z, code))
+    return found
 
 
-def _corners(face: _Face, half_u: Array, half_v: Array, usable: Array) -> _Candidates:
-    side_u, side_v = _signs(half_u)
-    u, v = side_u * half_u, side_v * half_v
-    alpha, beta = _solve(face, u - face.center.x, v - face.center.y, usable)
-    valid = (jnp.abs(alpha) <= 1.0) & (jnp.abs(beta) <= 1.0) & usable
-    w = face.center.z + alpha * face.alpha.z + beta * face.beta.z
-    return _Candidates(u, v, w, jnp.where(valid, _codes(2, half_u), -1.0))
-
-
-def _codes(group: int, like: Array) -> Array:
-    """Number of each candidate of a group on the leading axis."""
-    return jnp.asarray(4 * group + np.arange(4).reshape((4,) + (1,) * like.ndim), like.dtype)
+def _corners(face: _Face, half_u: Array, half_v: Array, usable: Array) -> list[_Candidate]:
+    found = []
+    for index, (side_u, side_v) in enumerate(SIGNS):
+        u, v = side_u * half_u, side_v * half_v
+        alpha, beta = _solve(face, u - face.center.x, v - face.center.y, usable)
+        valid = (jnp.abs(alpha) <= 1.0) & (jnp.abs(beta) <= 1.0) & usable
+        w = face.center.z + alpha * face.alpha.z + beta * face.beta.z
+        found.append(_Candidate(u, v, w, jnp.where(valid, 8.0 + index, -1.0).astype(w.dtype)))
+    return found
 
 
 def _solve(face: _Face, u: Array, v: Array, usable: Array) -> tuple[Array, Array]:
@@ -173,35 +178,23 @@ def _reciprocal(value: Array, scale: Array) -> Array:
     return 1.0 / jnp.where(jnp.abs(value) > tiny, value, jnp.where(value < 0, -tiny, tiny))
 
 
-def _winner(scores: list[Array], candidates: list[_Candidates], threshold: Array | float) -> Array:
-    """Settled code of the valid candidate of the highest score above the threshold, -1 where there is none."""
+def _winner(scores: list[Array], candidates: list[_Candidate], threshold: Array | float) -> _Candidate:
+    """The valid candidate of the highest score above the threshold; where there is none, code -1."""
     lowest = jnp.finfo(scores[0].dtype).min
-    best, code = jnp.where(candidates[0].code >= 0, scores[0], lowest), candidates[0].code
-    for score, candidate in zip(scores[1:], candidates[1:], strict=True):
-        better = (candidate.code >= 0) & (score > best)
-        best, code = jnp.where(better, score, best), jnp.where(better, candidate.code, code)
-    best, code = _better(best[:2], code[:2], best[2:], code[2:])
-    best, code = _better(best[0], code[0], best[1], code[1])
-    return settle_code(jnp.where(best > threshold, code, -1.0))
+    entries = [(jnp.where(c.code >= 0, score, lowest), c) for score, c in zip(scores, candidates, strict=True)]
+    lanes = [_better(_better(*entries[k:8:4]), entries[8 + k]) for k in range(4)]
+    best, winner = _better(_better(lanes[0], lanes[2]), _better(lanes[1], lanes[3]))
+    return winner._replace(code=jnp.where(best > threshold, winner.code, -1.0))
 
 
-def _coordinates(code: Array, candidates: list[_Candidates]) -> tuple[Array, Array]:
-    """(u, v) of the candidate with this code (finite and meaningless for an empty slot)."""
-    wanted = code.astype(candidates[0].code.dtype)
-    zero = jnp.zeros((), candidates[0].u.dtype)
-    u = sum((jnp.where(c.code == wanted, c.u, 0.0) for c in candidates), zero)
-    v = sum((jnp.where(c.code == wanted, c.v, 0.0) for c in candidates), zero)
-    return u[0] + u[1] + u[2] + u[3], v[0] + v[1] + v[2] + v[3]
+def _better(entry: tuple[Array, _Candidate], other: tuple[Array, _Candidate]) -> tuple[Array, _Candidate]:
+    better = other[0] > entry[0]
+    return jax.tree.map(lambda old, new: jnp.where(better, new, old), entry, other)
 
 
-def _area(u0: Array, v0: Array, u1: Array, v1: Array, c: _Candidates) -> Array:
-    """Twice the signed area of the triangle of two points and each candidate."""
-    return (u1 - u0) * (c.v - v0) - (v1 - v0) * (c.u - u0)
-
-
-def _better(best: Array, code: Array, other: Array, other_code: Array) -> tuple[Array, Array]:
-    better = other > best
-    return jnp.where(better, other, best), jnp.where(better, other_code, code)
+def _area(a: _Candidate, b: _Candidate, c: _Candidate) -> Array:
+    """Twice the signed area of a triangle."""
+    return (b.u - a.u) * (c.v - a.v) - (b.v - a.v) * (c.u - a.u)
 
 
 class CodeParts(NamedTuple):

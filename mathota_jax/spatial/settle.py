@@ -60,6 +60,22 @@ def store(value: Array, source: Array) -> Array:
     return value / (lax.stop_gradient(source) * 0 + 1)
 
 
+@jax.custom_jvp
+def derive_once(value: Array) -> Array:
+    """Returns `value`; its tangent, or in reverse mode its cotangent, is computed exactly once (see `store`).
+
+    A cotangent that goes into several parameters, such as that of a direction into the four components of a quaternion, is
+    otherwise computed anew for each. Costs nothing where no derivative is taken.
+    """
+    return value
+
+
+@derive_once.defjvp
+def _derive_once_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (value,), (tangent,) = primals, tangents
+    return derive_once(value), store(tangent, value)
+
+
 def materialize(values: Any) -> Any:
     """Stores every array of a pytree, and in reverse mode its cotangent, before anything else reads it.
 

@@ -66,7 +66,7 @@ def tied_scene():
         "pa": np.zeros((count, 3)),
         "qa": np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),
         "pb": np.zeros((count, 3)),
-        "qb": turns[[row[1] for row in rows]].as_quat()[:, [3, 0, 1, 2]],
+        "qb": turns.as_quat()[[row[1] for row in rows]][:, [3, 0, 1, 2]],
     }
     for index, ((half_a, half_b), turn, (aside, across), gap) in enumerate(rows):
         height = half_a[1] + np.abs(turns[turn].as_matrix()[1]) @ half_b + gap
