@@ -234,7 +234,8 @@ def oracle(placed, tolerance=1e-10):
         candidates = [axes[-1], -axes[-1], *([aside] if aside.any() else [])]
         normal = max(candidates, key=placed.reach)
         return placed.reach(normal), normal
-    hull = ConvexHull(np.array(points), incremental=True)
+    # Q12: Qhull gives up on a facet a hundred of its round-offs (1e-17 m) wide, which is nothing beside the tolerance.
+    hull = ConvexHull(np.array(points), incremental=True, qhull_options="Qt Q12")
     for _ in range(400):
         facet = np.argmax(hull.equations[:, 3])
         normal = -hull.equations[facet, :3]

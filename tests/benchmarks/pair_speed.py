@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import pathlib
 import time
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from mathota_jax.collision.pairs import PAIRS, SEARCHED
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import to_matrix
 from tests.benchmarks import pair_peers
+from tests.benchmarks.process import ONE_CORE
 from tests.benchmarks.settings import QUICK
 from tests.benchmarks.timing import Contestant, interleave, paired_ratio, summary
 from tests.convex_oracle import Placed, oracle, to_engine
@@ -83,6 +85,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--count", type=int, default=4096)
     parser.add_argument("--cases", default=",".join(CASES))
     options = parser.parse_args(arguments)
+    os.environ.update(ONE_CORE)  # read when XLA starts, with the first computation
     RESULTS.mkdir(exist_ok=True)
     stored = RESULTS / "pair_speed.json"
     known = json.loads(stored.read_text()) if stored.exists() else {}
@@ -202,8 +205,8 @@ def table(cases: dict[str, Any], count: int) -> str:
         "# Speed of the narrow phase",
         "",
         f"Written by `python -m tests.benchmarks.pair_speed --count {count}`: {count} pairs in float32 (Coal: float64, from",
-        "a Python loop), one thread, process CPU time, contestants in turns, medians. All see the same poses; shapes are",
-        "about 1 m in radius. Signed distance: with normal and points, the least of the manifold for closed forms. Error:",
+        "a Python loop), XLA in one thread, process CPU time, contestants in turns, medians. All see the same poses;",
+        "shapes are about 1 m in radius. Signed distance: with normal and points, of closed forms the least of the manifold. Error:",
         f"the largest of {CHECKED} separations [m] against cutting planes in float64.",
         "",
         "| case | method | overlapping | contestant | pairs per CPU-s | error | compile CPU-s |",

@@ -31,9 +31,9 @@ def capsule_capsule(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: 
     axis_a, axis_b, offset = (v.map(derive_once) for v in (axis_a, axis_b, offset))
     t_a, t_b = closest_parameters(offset, axis_a, axis_b, length_a, length_b)
 
-    across = cross(axis_a, axis_b)
-    fallback = direction(across, perpendicular(axis_a), 1.0)
-    difference = offset + axis_b * t_b - axis_a * t_a
+    across = cross(axis_a, axis_b).map(derive_once)
+    fallback = direction(across, perpendicular(axis_a).map(derive_once), 1.0)
+    difference = (offset + axis_b * t_b - axis_a * t_a).map(derive_once)
     normal = direction(difference, fallback, radius_a + radius_b)
 
     # The overlap on A's axis: both shadows are intervals, each bound carries the end it comes from.
