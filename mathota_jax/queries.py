@@ -18,7 +18,7 @@ from jax.core import Tracer
 from mathota_jax.batching import batch_last
 from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.manifold import Manifold, Nearest
-from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.collision.pairs import PAIRS, Pair
 from mathota_jax.geometry import SHAPES, Shape
 from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.geometry.hull import padded_faces
@@ -199,12 +199,22 @@ def _key(a: Geometry, b: Geometry) -> tuple[str, str]:
     return (a.kind, b.kind) if order.index(a.kind) <= order.index(b.kind) else (b.kind, a.kind)
 
 
-def _run_pair(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> Manifold:
-    """The pair function, in the order of the registry; the normal leads from A to B whatever the order."""
+_Placed = tuple[dict[str, Any], Pose]
+
+
+def _ordered(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> tuple[Pair, _Placed, _Placed, bool]:
+    """The entry of the registry, both shapes in its order as pair functions take them, and whether they are swapped."""
     key = _key(a, b)
+    placed = _placed(a, pose_a), _placed(b, pose_b)
     swapped = key != (a.kind, b.kind)
-    first, second = ((b, pose_b), (a, pose_a)) if swapped else ((a, pose_a), (b, pose_b))
-    found = PAIRS[key].function(*_placed(*first), *_placed(*second))
+    first, second = placed[::-1] if swapped else placed
+    return PAIRS[key], first, second, swapped
+
+
+def _run_pair(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> Manifold:
+    """The contact points; the normal leads from A to B whatever the order of the registry."""
+    pair, first, second, swapped = _ordered(a, pose_a, b, pose_b)
+    found = pair.function(*first, *second)
     return _reversed(found) if swapped else found
 
 
@@ -213,7 +223,7 @@ def _reversed(found: Manifold) -> Manifold:
     return Manifold(-found.normal, tuple(points))
 
 
-def _placed(geometry: Geometry, pose: Pose) -> tuple[dict[str, Any], Pose]:
+def _placed(geometry: Geometry, pose: Pose) -> _Placed:
     """Parameters and pose as pair functions take them: a plane is given in the world frame."""
     sizes = _sizes(geometry)
     if geometry.kind != "plane":
@@ -252,15 +262,9 @@ def _placement(position: Vec3, orientation: Quaternion) -> Pose:
 
 
 def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> Nearest:
-    """The closest points, in the order of the registry, components (1, world); the normal leads from A to B."""
-    key = _key(a, b)
-    swapped = key != (a.kind, b.kind)
-    first, second = ((b, pose_b), (a, pose_a)) if swapped else ((a, pose_a), (b, pose_b))
-    distance = PAIRS[key].distance
-    if distance is None:
-        found = _deepest(PAIRS[key].function(*_placed(*first), *_placed(*second)))
-    else:
-        found = distance(*_placed(*first), *_placed(*second))
+    """The closest points, components (1, world); the normal leads from A to B whatever the order of the registry."""
+    pair, first, second, swapped = _ordered(a, pose_a, b, pose_b)
+    found = _deepest(pair.function(*first, *second)) if pair.distance is None else pair.distance(*first, *second)
     return Nearest(found.separation, -found.normal, found.point_b, found.point_a, found.converged) if swapped else found
 
 

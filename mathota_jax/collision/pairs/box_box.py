@@ -28,7 +28,7 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
 
     Faces are preferred to edges and A's faces to B's (`box_axes`); the separations reported are those of the features
     chosen, without the preference. The least separation of separated boxes is their distance, to the same preference
-    (1e-3 of the size, nothing beyond a gap of 1e-2 of the size).
+    (1e-3 of the size, nothing beyond a gap of 1e-2 of the size). `box_distance` is exact.
 
     Features do not depend on which box is the reference: corners are numbered by bits (x, y, z positive), edges by
     ``4 * direction + bits`` of the sides of the next two axes in cyclic order.
