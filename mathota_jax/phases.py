@@ -129,8 +129,7 @@ def correct_positions(
             joint.position_rows(scene, group.table, problem.joints, error, inertia) for group in problem.joint_rows
         ]
     for group in problem.contact_rows:
-        known = group.rows
-        change = first_row_velocity(known.table, known.jacobian, known.places, packed)
+        change = first_row_velocity(group.rows, packed)
         rows.append(contact.position_rows(group, change, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)
