@@ -269,7 +269,7 @@ def _row_bound(
     jacobian, response = entries
     total = _largest_eigenvalue(jacobian, response, rows)
     if count == 1:
-        return total
+        return compute_once(total, active)
 
     def block(row: int, column: int) -> Array:
         return point_responses([side[row] for side in jacobian], [side[column] for side in response], count)
@@ -281,7 +281,8 @@ def _row_bound(
     squared = sum((entries**2 for entries in blocks), jnp.zeros(()))
     others = 1.0 - np.eye(count)[:, :, None]
     norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], -1, 1, count, active.shape[-1]))
-    return functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total) / RELAXATION
+    total = functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total)
+    return compute_once(total / RELAXATION, active)
 
 
 def _entries(matrix: Points) -> tuple[Entries, Entries]:
