@@ -168,8 +168,8 @@ def add_changes(group: Rows, matrix: Changes, velocity: Array, impulse: Array) -
     Its components may be others than those of a velocity.
     """
     table = group.table
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((velocity, impulse, matrix)))
     if group.places is not None:
-        worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((velocity, impulse, matrix)))
         return _add_at_places(table.together, group.places, matrix, in_every_world(velocity, worlds), impulse)
     if table.turn_count <= UNROLLED_SUMS:
         for turn, (part, values) in enumerate(_by_turn((matrix, impulse), table.turn_count)):
@@ -180,7 +180,8 @@ def add_changes(group: Rows, matrix: Changes, velocity: Array, impulse: Array) -
         receivers, part, values = at_turn
         return receive(velocity, receivers, part.changes(values, table.together)), None
 
-    return lax.scan(body, velocity, (jnp.asarray(table.receivers), matrix, impulse))[0]
+    start = in_every_world(velocity, worlds)
+    return lax.scan(body, start, (jnp.asarray(table.receivers), matrix, impulse))[0]
 
 
 def _by_turn(tree: Any, turn_count: int) -> list[Any]:
