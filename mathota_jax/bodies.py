@@ -14,6 +14,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.quaternion import multiply as multiply_quaternions
+from mathota_jax.spatial.settle import store_cotangents
 from mathota_jax.spatial.vector import Mat3, Vec3, multiply
 from mathota_jax.state import State
 
@@ -45,15 +46,16 @@ class Inertia(NamedTuple):
         """Angular momentum of an angular velocity, world frame."""
         if self.rotation is None:
             return multiply(self.moments, angular_velocity)
-        return self.rotation.apply(multiply(self.moments, self.rotation.apply_transposed(angular_velocity)))
+        local = store_cotangents(self.rotation.apply_transposed(angular_velocity))
+        return store_cotangents(self.rotation.apply(multiply(self.moments, local)))
 
     def solve(self, torque: Vec3) -> Vec3:
         """Inverse inertia times a vector, world frame."""
         if self.rotation is None:
             return Vec3(torque.x / self.moments.x, torque.y / self.moments.y, torque.z / self.moments.z)
-        local = self.rotation.apply_transposed(torque)
+        local = store_cotangents(self.rotation.apply_transposed(torque))
         local = Vec3(local.x / self.moments.x, local.y / self.moments.y, local.z / self.moments.z)
-        return self.rotation.apply(local)
+        return store_cotangents(self.rotation.apply(local))
 
     def inverse(self) -> InverseInertia:
         """The inverse in the world frame."""

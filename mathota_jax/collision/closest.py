@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.collision.manifold import ContactPoint, Manifold
-from mathota_jax.spatial.settle import derive_once, settle
+from mathota_jax.spatial.settle import settle, store_cotangents
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis, where
 
 
@@ -78,11 +78,11 @@ def closest_parameters(
     Source: C. Ericson, "Real-Time Collision Detection" (2005), section 5.1.9. The determinant is taken from the
     rejected component rather than as ``1 - cos^2``, which cancels; parallel axes start from the overlap's middle.
     """
-    cosine = derive_once(dot(axis_a, axis_b))
-    along_a = derive_once(dot(axis_a, offset))
-    along_b = derive_once(dot(axis_b, offset))
+    cosine = store_cotangents(dot(axis_a, axis_b))
+    along_a = store_cotangents(dot(axis_a, offset))
+    along_b = store_cotangents(dot(axis_b, offset))
     across = axis_b - axis_a * cosine
-    sine_squared = derive_once(dot(across, across))
+    sine_squared = store_cotangents(dot(across, across))
     parallel = settle((sine_squared < 64.0 * jnp.finfo(sine_squared.dtype).eps).astype(sine_squared.dtype)) > 0.5
     # The unconstrained minimum: offset + b * axis_b - a * axis_a is perpendicular to both axes.
     line_a = (along_a - cosine * along_b) / jnp.where(parallel, 1.0, sine_squared)
@@ -93,4 +93,4 @@ def closest_parameters(
     a = jnp.where(parallel, 0.5 * (low + high), clamp(line_a, -half_length_a, half_length_a))
     b = clamp(cosine * a - along_b, -half_length_b, half_length_b)
     a = clamp(cosine * b + along_a, -half_length_a, half_length_a)
-    return derive_once(a), derive_once(b)
+    return store_cotangents(a), store_cotangents(b)

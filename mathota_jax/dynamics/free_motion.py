@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -116,6 +117,8 @@ def _fast_rotation_vector(inverse: Vec3, start: Vec3, dt: Array, theta: Vec3) ->
     angle = lax.stop_gradient(_largest_rate(inverse, start) * dt)
     fast = settle(jnp.where((angle > LARGEST_ANGLE) & (angle < jnp.inf), 1.0, 0.0)) > 0.5
 
+    # Reverse mode would store every part, and fill as many arrays with zeros where the parts are skipped.
+    @jax.checkpoint
     def in_parts(inverse: Vec3, start: Vec3, dt: Array, theta: Vec3) -> Vec3:
         # Beyond a radian a part there is nothing to resolve.
         slowed = jnp.where(fast, jnp.minimum(1.0, PARTS / jnp.where(fast, angle, 1.0)), 0.0)

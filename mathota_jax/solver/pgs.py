@@ -34,7 +34,7 @@ from mathota_jax.solver.rows import (
 )
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
-from mathota_jax.spatial.settle import compute_once, store
+from mathota_jax.spatial.settle import compute_once, store, store_cotangents
 from mathota_jax.spatial.spread import add_slices, spread
 
 Update = Callable[[Any, Array, Array], Array]
@@ -185,9 +185,10 @@ def linearise(
         d_velocity = add_changes(group, d_group.matrix, d_velocity, impulse)
     jacobians, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        error = group.bias + row_velocity(group, velocity)
+        # The error goes into every entry of the Jacobians of the law, its cotangent into that of every entry of the matrix.
+        error = compute_once(group.bias + row_velocity(group, velocity), velocity)
         d_error = d_group.bias + row_velocity(group, d_velocity)
-        d_error = d_error + matrix_velocity(group.table, d_group.matrix, group.places, velocity)
+        d_error = store_cotangents(d_error + matrix_velocity(group.table, d_group.matrix, group.places, velocity))
         jacobians.append(_linearise(group.law, impulse, error))
         right_sides.append(
             jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023

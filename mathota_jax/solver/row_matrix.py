@@ -15,7 +15,7 @@ from jax import Array
 
 from mathota_jax.bodies import InverseInertia
 from mathota_jax.spatial.indexing import unstack
-from mathota_jax.spatial.settle import store
+from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.struct import pytree
@@ -131,7 +131,10 @@ class Points:
         return Points(self.directions[:, :1], tuple(side[:, :1] for side in self.angular), self.inertia)
 
     def dense(self) -> Dense:
-        """The same rows with all entries."""
+        """The same rows with all entries. Stored: each product, and each cotangent, would compute them again."""
+        return compute_once(self._dense(), self.like)
+
+    def _dense(self) -> Dense:
         if not self.angular:
             return Dense(self.linear(), self.linear_responses())
 

@@ -11,6 +11,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
 
 def settle(decision: Array) -> Array:
@@ -60,20 +63,28 @@ def store(value: Array, source: Array) -> Array:
     return value / (lax.stop_gradient(source) * 0 + 1)
 
 
-@jax.custom_jvp
-def derive_once(value: Array) -> Array:
-    """Returns `value`; its tangent, or in reverse mode its cotangent, is computed exactly once (see `store`).
+def store_cotangents(values: Any) -> Any:
+    """Returns the pytree unchanged, at no cost; in reverse mode each cotangent is computed exactly once.
 
-    A cotangent that goes into several parameters, such as that of a direction into the four components of a quaternion, is
-    otherwise computed anew for each. Costs nothing where no derivative is taken.
+    The cotangent of a vector that a matrix multiplies goes into those of the nine entries of the matrix, and its expression
+    with it, into nine kernels.
+
+    Args:
+        values: Pytree of floating-point arrays.
     """
-    return value
+    return jax.tree.map(_store_cotangent_p.bind, values)
 
 
-@derive_once.defjvp
-def _derive_once_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    (value,), (tangent,) = primals, tangents
-    return derive_once(value), store(tangent, value)
+def _transpose_store_cotangent(cotangent: Any, array: Any) -> list[Any]:
+    return [ad.Zero(array.aval) if type(cotangent) is ad.Zero else store(cotangent, cotangent)]
+
+
+_store_cotangent_p = Primitive("store_cotangent")
+_store_cotangent_p.def_impl(lambda array: array)
+_store_cotangent_p.def_abstract_eval(lambda array: ShapedArray(array.shape, array.dtype))
+ad.deflinear2(_store_cotangent_p, _transpose_store_cotangent)
+batching.defvectorized(_store_cotangent_p)
+mlir.register_lowering(_store_cotangent_p, mlir.lower_fun(lambda array: array, multiple_results=False))
 
 
 def materialize(values: Any) -> Any:

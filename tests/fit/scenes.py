@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import jax
 import numpy as np
@@ -19,6 +20,21 @@ NOISE = Noise(position=1e-3, orientation=np.radians(1.0))
 FRAME = 1 / 60
 SUBSTEPS = 2
 FRAMES = 61
+RADIUS = 0.1
+
+
+def bounce_height(times, restitution, drop=1.0):
+    """Height of a ball above its resting height after it was dropped: parabolas between impacts (BENCHMARKS A12a)."""
+    heights = []
+    for time in times:
+        if time < (first := math.sqrt(2 * drop / GRAVITY)):
+            heights.append(drop - GRAVITY * time**2 / 2)
+            continue
+        time, speed = time - first, restitution * GRAVITY * first
+        while time > 2 * speed / GRAVITY:
+            time, speed = time - 2 * speed / GRAVITY, speed * restitution
+        heights.append(speed * time - GRAVITY * time**2 / 2)
+    return np.asarray(heights)
 
 
 def struck_ball():

@@ -11,24 +11,20 @@ from mathota_jax.fit import Noise, Parameter, Trajectories, fit
 from mathota_jax.fit.fitting import solve
 from mathota_jax.fit.objective import Objective
 from mathota_jax.fit.parameters import parameter_vector
-from tests.fit.scenes import FRAME, GRAVITY, NOISE, SUBSTEPS, TRUTH, clean_throws, noisy, struck_ball, unknown
+from tests.fit.scenes import (
+    FRAME,
+    GRAVITY,
+    NOISE,
+    RADIUS,
+    SUBSTEPS,
+    TRUTH,
+    bounce_height,
+    clean_throws,
+    noisy,
+    struck_ball,
+    unknown,
+)
 from tests.scenes import undamped
-
-RADIUS = 0.1
-
-
-def bounce_height(times, restitution, drop=1.0):
-    """Height of a ball above its resting height after it was dropped: parabolas between impacts (BENCHMARKS A12a)."""
-    heights = []
-    for time in times:
-        if time < (first := math.sqrt(2 * drop / GRAVITY)):
-            heights.append(drop - GRAVITY * time**2 / 2)
-            continue
-        time, speed = time - first, restitution * GRAVITY * first
-        while time > 2 * speed / GRAVITY:
-            time, speed = time - 2 * speed / GRAVITY, speed * restitution
-        heights.append(speed * time - GRAVITY * time**2 / 2)
-    return np.asarray(heights)
 
 
 def dropped_ball():

@@ -9,7 +9,7 @@ from mathota_jax.collision.closest import clamp, closest_parameters, direction, 
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import derive_once, settle_code
+from mathota_jax.spatial.settle import settle_code, store_cotangents
 from mathota_jax.spatial.vector import cross, dot
 
 PARALLEL_SINE = 0.02
@@ -28,12 +28,12 @@ def capsule_capsule(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: 
     length_a, length_b = a["half_height"], b["half_height"]
     radius_a, radius_b = a["radius"], b["radius"]
     offset = pose_b.position - pose_a.position
-    axis_a, axis_b, offset = (v.map(derive_once) for v in (axis_a, axis_b, offset))
+    axis_a, axis_b, offset = (v.map(store_cotangents) for v in (axis_a, axis_b, offset))
     t_a, t_b = closest_parameters(offset, axis_a, axis_b, length_a, length_b)
 
-    across = cross(axis_a, axis_b).map(derive_once)
-    fallback = direction(across, perpendicular(axis_a).map(derive_once), 1.0)
-    difference = (offset + axis_b * t_b - axis_a * t_a).map(derive_once)
+    across = cross(axis_a, axis_b).map(store_cotangents)
+    fallback = direction(across, perpendicular(axis_a).map(store_cotangents), 1.0)
+    difference = (offset + axis_b * t_b - axis_a * t_a).map(store_cotangents)
     normal = direction(difference, fallback, radius_a + radius_b)
 
     # The overlap on A's axis: both shadows are intervals, each bound carries the end it comes from.

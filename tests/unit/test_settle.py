@@ -1,0 +1,50 @@
+"""What is stored in reverse mode, and what is not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.test_util import check_grads
+
+from mathota_jax.bodies import Inertia
+from mathota_jax.dynamics.free_motion import PARTS, rotate_at_constant_momentum
+from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.settle import store_cotangents
+from mathota_jax.spatial.vector import Vec3
+
+
+def product(matrix, vector):
+    """A product whose factor and result both have cotangents that are computed once."""
+    return jnp.sin(store_cotangents(matrix @ store_cotangents(jnp.cos(vector))))
+
+
+def arguments():
+    random = np.random.default_rng(0)
+    return jnp.asarray(random.normal(size=(4, 3))), jnp.asarray(random.normal(size=(3, 5)))
+
+
+def test_values_and_derivatives_of_any_order_are_unchanged(float64):
+    matrix, vector = arguments()
+    np.testing.assert_array_equal(product(matrix, vector), jnp.sin(matrix @ jnp.cos(vector)))
+    check_grads(product, (matrix, vector), order=2, rtol=1e-6)
+    check_grads(jax.vmap(product, in_axes=(None, 1)), (matrix, vector), order=1, rtol=1e-6)
+
+
+def test_the_value_itself_costs_nothing():
+    matrix, vector = arguments()
+    assert "divide" not in jax.jit(product).lower(matrix, vector).as_text()
+    assert "divide" in jax.jit(jax.grad(lambda v: product(matrix, v).sum())).lower(vector).as_text()
+
+
+def test_parts_of_fast_turns_are_not_stored():
+    """A step of all bodies in one part must not carry `PARTS` intermediate poses to its reverse pass."""
+    one, zero = jnp.ones((2, 3)), jnp.zeros((2, 3))
+    orientation = Quaternion(one, zero, zero, zero)
+    inertia = Inertia(one, Vec3(one, 2.0 * one, 3.0 * one), to_matrix(orientation))
+
+    def turned(momentum):
+        return rotate_at_constant_momentum(orientation, inertia, Vec3(momentum, momentum, zero), jnp.asarray(0.01))[1].x
+
+    program = jax.make_jaxpr(lambda m: jax.vjp(turned, m)[1](m))(one)
+    outer = [variable.aval.shape for equation in program.eqns for variable in equation.outvars]
+    assert (2, 3) in outer
+    assert not [shape for shape in outer if shape[:1] == (PARTS,)]
