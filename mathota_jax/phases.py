@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
-from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, motor
-from mathota_jax.constraints.mechanism_layout import covers, layout
+from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, mechanism_rows, motor
+from mathota_jax.constraints.joint_layout import joint_row_count
+from mathota_jax.constraints.mechanism_layout import bounded_slots, covers, layout
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import carried_velocity, free_velocity
@@ -78,9 +79,26 @@ def solve_rows(
     hold = functools.partial(mechanism.hold, problem.held, problem.joint_rows)
     if covers(scene):
         return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
-    _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
-    velocity, impulses, failed = _sweep(scene, rows, velocity, start, known=False)
-    return *hold(velocity, impulses), failed
+    bounded = () if problem.responses is None or scene.options.solver != "pgs" else bounded_slots(scene)
+    failed, joint_count = None, len(problem.joint_rows)
+    if bounded and not scene.slot_count and len(bounded) + len(problem.held.layout.slots) == joint_row_count(scene):
+        impulses = tuple(jnp.zeros_like(impulse) for impulse in start)
+    else:
+        _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
+        velocity, impulses, failed = _sweep(scene, rows, velocity, start, known=False)
+        start = impulses
+    velocity, impulses = hold(velocity, impulses)
+    if not bounded:
+        return velocity, impulses, failed
+    sweeps = scene.options.velocity_iterations
+    joints, others = impulses[:joint_count], impulses[joint_count:]
+    moved, change = mechanism_rows.solve(
+        problem.responses, problem.joint_rows, bounded, sweeps, velocity, joints, start[:joint_count]
+    )
+    # What the joints take for it; the velocity is known better.
+    joints = tuple(old + more for old, more in zip(joints, change, strict=True))
+    _, joints = hold(add_impulses(problem.joint_rows, velocity, change), joints)
+    return moved, (*joints, *others), failed
 
 
 def _sweep(

@@ -14,7 +14,8 @@ from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sid
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
-from mathota_jax.constraints.mechanism_layout import layout
+from mathota_jax.constraints.mechanism_layout import bounded_slots, layout
+from mathota_jax.constraints.mechanism_rows import Responses, own_mass
 from mathota_jax.constraints.row_coefficients import Coefficients
 from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
 from mathota_jax.model import Model
@@ -37,12 +38,14 @@ class JointMotion(NamedTuple):
       middle: rows at the middle of the step, whose Jacobians are used.
       coefficients: of the laws.
       inertia: of the moving bodies.
+      responses: to the rows with bounds of mechanisms; None where there are none.
     """
 
     start: JointRows
     middle: JointRows
     coefficients: Coefficients
     inertia: Inertia
+    responses: Responses | None = None
 
 
 def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
@@ -54,7 +57,8 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
     if (mechanisms := layout(scene)) is not None and scene.options.position_iterations:
         # They are closed at the end of each step; an error turned into velocity would whip a chain that starts open.
         error = jnp.where(np.isin(slots, mechanisms.slots)[:, None], 0.0, error)
-    columns = Columns(mass, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
+    felt = mass if motion.responses is None else _with_trees(scene, slots, mass, motion.responses)
+    columns = Columns(felt, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
     found = {law: LAWS[law](columns) for law in sorted(set(laws.tolist()))}
 
     def of_each(name: str) -> Any:
@@ -75,6 +79,17 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
         upper=_pack_bound(table, of_each("upper"), worlds),
     )
     return _pack(table, jacobians, responses, bias, law, worlds)
+
+
+def _with_trees(scene: Scene, slots: np.ndarray, mass: Array, responses: Responses) -> Array:
+    """``J M^-1 J^T`` of columns, for the rows of mechanisms with all that hangs on their joints.
+
+    A spring that saw two bodies alone would take a heavy arm for a fast oscillator, and damp it.
+    """
+    bounded = bounded_slots(scene)
+    inside = np.isin(slots, bounded)
+    own = own_mass(responses.matrix, mass, [bounded.index(slot) if slot in bounded else 0 for slot in slots.tolist()])
+    return own if inside.all() else jnp.where(inside[:, None], own, mass)
 
 
 def _by_law(laws: np.ndarray, values: dict[str, Any]) -> Any:

@@ -110,6 +110,25 @@ def covers(scene: Scene) -> bool:
     return found is not None and not scene.slot_count and len(found.slots) == joint_row_count(scene)
 
 
+@functools.cache
+def bounded_slots(scene: Scene) -> tuple[int, ...]:
+    """Slots of the rows with bounds, or soft ones, that act on nothing but links."""
+    found = layout(scene)
+    if found is None:
+        return ()
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    links = set(found.blocks)
+    slots = [
+        group.slots(row).start + place
+        for group in joint_groups(scene)
+        for place, joint in enumerate(group.joints)
+        for row in range(group.row_count)
+        if {block_of[body] for body in (scene.joints[joint].parent, scene.joints[joint].child) if body in block_of}
+        <= links
+    ]
+    return tuple(sorted(set(slots) - set(found.slots)))
+
+
 def _held_slots(group: JointGroup, place: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Slots of the rows of a joint that hold translations, and rotations, whatever happens."""
     kind, row = group.kind, group.kind.fixed_row_count
