@@ -109,14 +109,17 @@ def _pack_bound(table: Table, bound: Any, worlds: int) -> Array:
     return columns.reshape(table.turn_count, 1, len(table.slots[0]), 1)
 
 
-def position_rows(scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia) -> Rows:
-    """Rows of one table for the position correction; `error` (slot, world) is that after the step."""
+def position_rows(
+    scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia, left_out: tuple[int, ...] = ()
+) -> Rows:
+    """Rows of one table for the position correction, void in slots `left_out`; `error` (slot, world) after the step."""
     jacobians, responses, mass = _sides(scene, table, joints, inertia)
-    laws = joints.laws[np.maximum(table.order, 0)]
+    slots = np.maximum(table.order, 0)
+    laws = joints.laws[slots]
     one_sided = laws == STOP
     error = select(table, error)
     worlds = max(mass.shape[-1], error.shape[-1])
-    free = np.where(np.isin(laws, CORRECTED), np.inf, 0.0)
+    free = np.where(np.isin(laws, CORRECTED) & ~np.isin(slots, left_out), np.inf, 0.0)
     law = Bounded(
         effective_mass=jax.lax.stop_gradient(pack_scalars(table, [1.0 / mass], worlds)),
         softness=_bounds(table, np.zeros(one_sided.shape)),

@@ -110,6 +110,14 @@ def covers(scene: Scene) -> bool:
     return found is not None and not scene.slot_count and len(found.slots) == joint_row_count(scene)
 
 
+def covers_with_bounds(scene: Scene) -> bool:
+    """Whether it has no others than those and rows with bounds on mechanisms."""
+    found = layout(scene)
+    if found is None or scene.slot_count:
+        return False
+    return len(found.slots) + len(bounded_slots(scene)) == joint_row_count(scene)
+
+
 @functools.cache
 def bounded_slots(scene: Scene) -> tuple[int, ...]:
     """Slots of the rows with bounds, or soft ones, that act on nothing but links."""

@@ -18,6 +18,8 @@ from jax import Array, lax
 
 from mathota_jax.constraints import mechanism
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
+from mathota_jax.constraints.joint_rows import JointRows
+from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.rows import Rows, add_scaled, row_velocity
 from mathota_jax.solver.table import EMPTY
@@ -25,7 +27,7 @@ from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once
 
 STIFF = 16
-"""Multiples of the machine epsilon, relative to the two bodies alone, of the least motion that a tree can be said to allow."""
+"""Multiples of the machine epsilon, relative to two bodies alone, of the least motion that a tree can be said to allow."""
 
 
 class Responses(NamedTuple):
@@ -40,9 +42,7 @@ class Responses(NamedTuple):
     matrix: Array
 
 
-def responses(
-    links: mechanism.Links, joint_rows: Sequence[Rows], slots: tuple[int, ...]
-) -> Responses:
+def responses(links: mechanism.Links, joint_rows: Sequence[Rows], slots: tuple[int, ...]) -> Responses:
     """The responses to the rows of some slots, which act on nothing but links.
 
     Args:
@@ -105,6 +105,41 @@ def solve(
     return moved, _to_tables(joint_rows, slots, change)
 
 
+def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:
+    """Whether some of the rows are stops."""
+    return bool((joints.laws[np.asarray(slots)] == STOP).any())
+
+
+def leave_stops(
+    responses: Responses,
+    joint_rows: Sequence[Rows],
+    slots: tuple[int, ...],
+    joints: JointRows,
+    error: Array,
+    sweeps: int,
+) -> Array:
+    """Displacement (component, block, world) that takes trees back from what they are beyond their stops.
+
+    Args:
+      responses: to the rows of `slots`.
+      joint_rows: all joint rows, as the velocity solver had them.
+      slots: of these rows.
+      joints: all joint rows.
+      error: (slot, world) of all rows at the end of the step.
+      sweeps: over the rows.
+    """
+    stops = np.flatnonzero(joints.laws[np.asarray(slots)] == STOP)
+    matrix = responses.matrix[stops][:, stops]
+    error = take(error, np.asarray(slots)[stops])
+    worlds = max(error.shape[-1], matrix.shape[-1])
+    nothing = jnp.zeros((len(stops), worlds), error.dtype)
+    masses = [group.law.effective_mass for group in joint_rows if isinstance(group.law, Bounded)]
+    alone = of_slots(joint_rows, tuple(np.asarray(slots)[stops]), masses)
+    law = Bounded(alone, nothing, nothing, nothing + jnp.inf)
+    pushes = _sweep(sweeps, matrix, law, nothing, jnp.broadcast_to(error, nothing.shape))
+    return (responses.velocity[:, :, stops] * pushes).sum(2)
+
+
 def of_slots(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Sequence[Array]) -> Array:
     """(row, world) from the (turn, 1, column, world) values of all tables."""
     tables = [group.table for group in joint_rows]
@@ -118,9 +153,7 @@ def _to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array
     place = np.full(_slot_count(joint_rows), len(slots))
     place[np.asarray(slots)] = np.arange(len(slots))
     of_all = take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), place)
-    return tuple(
-        pack_scalars(group.table, [select(group.table, of_all)], values.shape[-1]) for group in joint_rows
-    )
+    return tuple(pack_scalars(group.table, [select(group.table, of_all)], values.shape[-1]) for group in joint_rows)
 
 
 def _slot_count(joint_rows: Sequence[Rows]) -> int:

@@ -41,7 +41,8 @@ class Forces(NamedTuple):
 class Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
 
-    `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of all groups, for the small steps alone.
+    `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of
+    all groups, for the small steps alone.
     """
 
     joints: joint_rows.JointRows | None

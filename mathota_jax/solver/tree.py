@@ -159,7 +159,8 @@ def respond(tree: Tree, factors: Factors, impulse: Pair) -> Pair:
     start = jax.tree.map(jnp.zeros_like, bias)
     if tree.floating:
         places = np.asarray(tree.floating)
-        roots = _solve_roots(factors.roots, jax.tree.map(lambda x: x[places], whole))
+        inertia = in_every_world(factors.roots, bias[0].shape[-1])
+        roots = _solve_roots(inertia, jax.tree.map(lambda x: x[places], whole))
         start = jax.tree.map(lambda x, root: x.at[places].set(-root), start, roots)
     return _outward(tree, release, start, (factors.offset, *columns, errors, start))
 

@@ -1,4 +1,4 @@
-"""Springs, friction, motors and stops on trees of joints: an arm welded of three blocks is one rigid body, with closed forms.
+"""Springs, friction, motors and stops on trees of joints. An arm welded of three blocks is one rigid body: closed forms.
 
 Each block has ten times the mass of the one before it, so that what a joint sees of its two bodies says nothing of the arm.
 """
@@ -119,7 +119,7 @@ def test_brake_stops_the_whole_arm(precision, gate):
 
 def test_friction_above_the_load_holds(precision, gate):
     _, angle, _ = of(precision, "held by friction")
-    gate("creep in 2 s [rad]", angle, 1e-5)
+    gate("creep in 2 s [rad]", angle, {"float32": 1e-4, "float64": 1e-8}[str(precision)])
 
 
 def test_velocity_motor_turns_the_whole_arm(precision, gate):

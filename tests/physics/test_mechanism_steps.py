@@ -21,7 +21,6 @@ from mathota_jax import (
     is_asleep,
     joint_gaps,
     momentum,
-    rollout,
     step,
     substep,
 )
@@ -35,7 +34,6 @@ from tests.scenes import (
     record_worlds,
     repeat,
     rotation_matrix,
-    stack,
     undamped,
     with_dt,
 )
@@ -175,14 +173,14 @@ def test_a_fast_chain_does_not_pass_a_wall(speed, gate):
     model, state = builder.build(undamped(dt=1 / 60, continuous=True))
     # Aslant: the ends arrive at different times.
     turn = np.linspace(0.0, 0.6, 4)
-    place = np.stack([-2.0 - 0.3 * np.arange(4) * np.sin(turn[-1]), 0.3 * np.arange(4) * np.cos(turn[-1]), 0 * turn], -1)
+    place = np.stack(
+        [-2.0 - 0.3 * np.arange(4) * np.sin(turn[-1]), 0.3 * np.arange(4) * np.cos(turn[-1]), 0 * turn], -1
+    )
     half = 0.5 * turn[-1]
     state = dataclasses.replace(
         state,
         position=state.position.at[1:].set(jnp.asarray(place, state.position.dtype)),
-        orientation=state.orientation.at[1:].set(
-            jnp.asarray([np.cos(half), 0, 0, np.sin(half)], state.position.dtype)
-        ),
+        orientation=state.orientation.at[1:].set(jnp.asarray([np.cos(half), 0, 0, np.sin(half)], state.position.dtype)),
     )
     _, record = record_worlds(
         repeat(model, 1), repeat(state, 1), 60,
