@@ -162,8 +162,7 @@ def correct_positions(
                 problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
             )
     for group in problem.contact_rows:
-        known = group.rows
-        change = first_row_velocity(known.table, known.jacobian, known.places, packed)
+        change = first_row_velocity(group.rows, packed)
         rows.append(contact.position_rows(group, change, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)

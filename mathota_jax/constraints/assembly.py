@@ -80,31 +80,16 @@ def pack_sides(table: Table | TracedTable, rows: Sequence[Side], worlds: int) ->
     return jnp.stack([pack_scalars(table, row, worlds) for row in components], axis=1)
 
 
-def pack_point_rows(table: Table | TracedTable, directions: Sequence[Vec3], arm: Vec3 | None, worlds: int) -> Array:
-    """(turn, row, component, column, world) of the rows of one point each, along its directions and at the end of its arm.
+def pack_directions(table: Table | TracedTable, directions: Sequence[Vec3], worlds: int) -> Array:
+    """(turn, row, 3, column, world) from one direction for each row, components (turn * column, world)."""
+    return jnp.stack([pack_scalars(table, part, worlds) for part in zip(*directions, strict=True)], axis=2)
 
-    Args:
-      directions: one for each row, components (turn * column, world).
-      arm: from the centre of mass, likewise; None where nothing couples to rotation.
-    """
-    linear = Vec3(*(pack_scalars(table, part, worlds) for part in zip(*directions, strict=True)))
-    if arm is None:
-        return jnp.stack(linear, axis=2)
+
+def turn_of_points(table: Table | TracedTable, directions: Array, arm: Vec3, worlds: int) -> Array:
+    """``arm x direction`` of the packed directions, same shape, at the ends of arms (turn * column, world)."""
+    linear = Vec3(*unstack(directions, 2))
     arms = Vec3(*(spread(pack_scalars(table, [part], worlds), linear.x.shape) for part in arm))
-    return jnp.stack([*linear, *cross(arms, linear)], axis=2)
-
-
-def respond_packed(table: Table | TracedTable, jacobian: Array, inertia: InverseInertia) -> Array:
-    """`respond` of all rows of a table: (turn, row, component, column, world), as the Jacobian."""
-    components = unstack(jacobian, 2)
-    shape = components[0].shape
-
-    def of_rows(values: Array) -> Array:
-        return spread(values.reshape(shape[0], 1, shape[2], -1), shape)
-
-    side = Side(Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None)
-    response = respond(side, jax.tree.map(of_rows, inertia))
-    return jnp.stack(response.linear if response.angular is None else (*response.linear, *response.angular), axis=2)
+    return jnp.stack(cross(arms, linear), axis=2)
 
 
 def pack_scalars(table: Table | TracedTable, values: Sequence[Array], worlds: int) -> Array:

@@ -28,7 +28,8 @@ from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
-from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, row_velocity
+from mathota_jax.solver.row_matrix import Dense
+from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, matrix_velocity, row_velocity
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
@@ -69,7 +70,7 @@ def foreseen(
             found.append((none, none))
             continue
 
-        start, free = (first_row_velocity(rows.table, rows.jacobian, rows.places, v) for v in (now, then))
+        start, free = (first_row_velocity(rows, v) for v in (now, then))
         e = _restitution(model, rows, worlds)
         # One of two bodies that fall may be held: to foresee too much costs a search, too little a contact.
         gap, acceleration = jnp.maximum(group.separation, 0.0), jnp.minimum((free - start) / left, -pull)
@@ -94,8 +95,8 @@ def _restitution(model: Model, rows: Rows, worlds: int) -> Array:
 
 def _speeds(rows: Rows, velocity: Array) -> Array:
     """(turn, 1, column, world) sum of the speeds of both bodies along the normal of each contact, or more."""
-    sides = [jnp.abs(side) for side in rows.jacobian]
-    return first_row_velocity(rows.table, sides, rows.places, jnp.abs(velocity))
+    sides = Dense(tuple(jnp.abs(side) for side in rows.jacobian), rows.response)
+    return matrix_velocity(rows.table, sides.first_row(), rows.places, jnp.abs(velocity))
 
 
 def without(rows: Rows, dropped: Array) -> Rows:
@@ -165,7 +166,7 @@ def _rounds(
         velocity, total = state
         rows, rebounds = list(held), [jnp.zeros_like(row.bias) for row in held]
         for group, e in zip(groups, bounce, strict=True):
-            speed = first_row_velocity(group.rows.table, group.rows.jacobian, None, velocity)
+            speed = first_row_velocity(group.rows, velocity)
             rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), e * speed, 0.0)
             # What does not bounce at all just holds: a ball rebounds from a plate that lies on the ground.
             chosen = without(group.rows, (_approach(group.rows, velocity) <= least) & (e > 0))
@@ -231,7 +232,7 @@ def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, f
 
 def _approach(rows: Rows, velocity: Array) -> Array:
     """(turn, 1, column, world) speed at which each contact approaches; 0 where there is none."""
-    speed = -first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
+    speed = -first_row_velocity(rows, velocity)
     return jnp.where(contact.normal_mass(rows) > 0, jnp.maximum(speed, 0.0), 0.0)
 
 

@@ -23,25 +23,29 @@ from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
 from mathota_jax.constraints.assembly import (
     collect,
     gather_columns,
-    pack_point_rows,
+    pack_directions,
     pack_scalars,
-    respond_packed,
     select,
     select_blocks,
     smaller_side,
+    turn_of_points,
 )
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.rows import Places, Rows, first_row_velocity
+from mathota_jax.solver.row_matrix import Points
+from mathota_jax.solver.rows import Places, Rows, matrix_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
+
+Entries = list[list[list[Array]]]
+"""Components (turn, column, world) by side and row."""
 
 RELAXATION = 4 / 3
 """Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
@@ -143,22 +147,12 @@ def contact_rows(
     worlds = max(chosen.separation.shape[-1], motion.velocity.shape[-1], motion.free_velocity.shape[-1])
     normal = chosen.normal
     directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
-    rotating = couples_rotation(scene)
-    jacobians, responses = [], []
-    for side, sign in enumerate(_signs(scene, table, pairs)):
-        position, inertia = select_blocks(table, side, (motion.position, motion.inertia), places)
-        # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
-        surface = chosen.position + normal * (jnp.maximum(chosen.separation, 0.0) * (0.5 * sign))
-        arm = compute_once(surface - position, chosen.separation)
-        signed = [direction * sign for direction in directions]
-        jacobian = compute_once(pack_point_rows(table, signed, arm if rotating else None, worlds), chosen.separation)
-        jacobians.append(jacobian)
-        responses.append(respond_packed(table, jacobian, inertia))
+    matrix = _matrix(scene, table, chosen, directions, motion, pairs, worlds)
     # Stored for reverse mode: else their cotangents are computed again for each entry of the Jacobians.
     start, free = (
         compute_once(along.reshape(-1, along.shape[-1]), chosen.separation)
         for along in (
-            first_row_velocity(table, jacobians, places, velocity)
+            matrix_velocity(table, matrix.first_row(), places, velocity)
             for velocity in (motion.velocity, motion.free_velocity)
         )
     )
@@ -170,20 +164,20 @@ def contact_rows(
         target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     # Empty columns of a table have no response.
-    mass = safe_divide(active, _row_bound(table, jacobians, responses, active, (0,)))
+    entries = _entries(matrix)
+    mass = safe_divide(active, _row_bound(table, entries, active, (0,)))
     bias = [-target]
     if scene.friction:
         law = Cone(
             normal_mass=mass,
-            tangent_mass=safe_divide(active, _row_bound(table, jacobians, responses, active, (1, 2))),
+            tangent_mass=safe_divide(active, _row_bound(table, entries, active, (1, 2))),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
         law = _push_only(mass[:, None])
     rows = Rows(
-        jacobian=tuple(jacobians),
-        response=tuple(responses),
+        matrix=matrix if scene.options.solver == "pgs" else matrix.dense(),
         bias=pack_scalars(table, bias, worlds),
         law=law,
         table=table,
@@ -199,6 +193,41 @@ def contact_rows(
         scene.options.slop * size,
         size,
     )
+
+
+def _matrix(
+    scene: Scene,
+    table: Table | TracedTable,
+    contacts: ContactSet,
+    directions: Sequence[Vec3],
+    motion: Motion,
+    pairs: PlacedPairs | None,
+    worlds: int,
+) -> Points:
+    """Jacobian and response of the contacts of one table; `contacts` are in its order."""
+    places = None if pairs is None else pairs.places
+    signs = _signs(scene, table, pairs)
+    along = [direction * signs[0] for direction in directions] if len(signs) == 1 else directions
+    packed = pack_directions(table, along, worlds)
+    packed = compute_once(packed, contacts.separation)
+    angular, inertias = [], []
+    for side, sign in enumerate(signs):
+        position, inertia = select_blocks(table, side, (motion.position, motion.inertia), places)
+        inertias.append(jax.tree.map(functools.partial(_of_constraints, table), inertia))
+        if not couples_rotation(scene):
+            continue
+        # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
+        surface = contacts.position + contacts.normal * (jnp.maximum(contacts.separation, 0.0) * (0.5 * sign))
+        arm = compute_once(surface - position, contacts.separation)
+        turned = turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds)
+        angular.append(compute_once(turned, contacts.separation))
+    return Points(packed, tuple(angular), tuple(inertias))
+
+
+def _of_constraints(table: Table | TracedTable, values: Array) -> Array:
+    """(turn, constraint, world) from the same value (turn * column, world) in all columns of a constraint."""
+    values = jnp.broadcast_to(values, (table.turn_count * table.column_count, values.shape[-1]))
+    return values.reshape(table.turn_count, -1, table.together, values.shape[-1])[:, :, 0]
 
 
 def rows_one_by_one(
@@ -225,8 +254,7 @@ def rows_one_by_one(
 
 def _row_bound(
     table: Table | TracedTable,
-    jacobians: Sequence[Array],
-    responses: Sequence[Array],
+    entries: tuple[Entries, Entries],
     active: Array,
     rows: tuple[int, ...],
 ) -> Array:
@@ -238,10 +266,7 @@ def _row_bound(
     mass.
     """
     count = table.together
-    # The length of a step does not move the fixed point: its derivative is not worth computing.
-    jacobian, response = (
-        [_components(side) for side in sides] for sides in jax.lax.stop_gradient((jacobians, responses))
-    )
+    jacobian, response = entries
     total = _largest_eigenvalue(jacobian, response, rows)
     if count == 1:
         return total
@@ -255,14 +280,23 @@ def _row_bound(
     return functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total) / RELAXATION
 
 
-def _components(packed: Array) -> list[list[Array]]:
-    """Components (turn, column, world) of each row."""
-    return [unstack(row, 1) for row in unstack(packed, 1)]
+def _entries(matrix: Points) -> tuple[Entries, Entries]:
+    """Entries of Jacobian and response for `_row_bound`."""
+    # The length of a step does not move the fixed point: its derivative is not worth computing.
+    matrix = jax.lax.stop_gradient(matrix)
+
+    linear, angular = matrix.linear_responses(), compute_once(matrix.angular_responses(), matrix.directions)
+    return _components(matrix.linear(), matrix.angular), _components(linear, angular)
 
 
-def _largest_eigenvalue(
-    jacobian: list[list[list[Array]]], response: list[list[list[Array]]], rows: tuple[int, ...]
-) -> Array:
+def _components(linear: Sequence[Array], angular: Sequence[Array]) -> Entries:
+    sides = zip(linear, angular, strict=True) if angular else ((side,) for side in linear)
+    return [
+        [[c for part in side for c in unstack(part[:, row], 1)] for row in range(side[0].shape[1])] for side in sides
+    ]
+
+
+def _largest_eigenvalue(jacobian: Entries, response: Entries, rows: tuple[int, ...]) -> Array:
     """Of the response of one point along one or two rows; the arguments hold components by side and row."""
 
     def entry(row: int, column: int) -> Array:
@@ -347,8 +381,7 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
     )
     mass = normal_mass(rows)
     return Rows(
-        jacobian=tuple(side[:, :1] for side in rows.jacobian),
-        response=tuple(side[:, :1] for side in rows.response),
+        matrix=rows.matrix.first_row(),
         bias=jnp.where(error < 0, percent * error, error),
         law=_push_only(mass),
         table=rows.table,

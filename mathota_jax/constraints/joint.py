@@ -21,6 +21,7 @@ from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded
+from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Table
 from mathota_jax.spatial.vector import where
@@ -137,8 +138,10 @@ def _bounds(table: Table, values: np.ndarray) -> Array:
 
 def _pack(table: Table, jacobians: list[Side], responses: list[Side], bias: Array, law: Bounded, worlds: int) -> Rows:
     return Rows(
-        jacobian=tuple(pack_sides(table, [jacobian], worlds) for jacobian in jacobians),
-        response=tuple(pack_sides(table, [response], worlds) for response in responses),
+        matrix=Dense(
+            tuple(pack_sides(table, [jacobian], worlds) for jacobian in jacobians),
+            tuple(pack_sides(table, [response], worlds) for response in responses),
+        ),
         bias=pack_scalars(table, [bias], worlds),
         law=law,
         table=table,

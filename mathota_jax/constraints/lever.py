@@ -11,10 +11,13 @@ from jax import Array
 
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.scene import Scene
-from mathota_jax.solver.rows import Rows, add_scaled
+from mathota_jax.solver.row_matrix import Dense, sum_over_points
+from mathota_jax.solver.rows import Rows, add_changes
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3, dot
+from mathota_jax.struct import pytree
 
 
 @functools.cache
@@ -62,23 +65,22 @@ def levers(
     total = jnp.zeros((6 if several else 2, *solved.shape[1:]), solved.dtype)
     for group, impulse in zip(joint_rows, impulses[:count], strict=True):
         # The linear part of the Jacobian makes a weight [N s] of the impulse, 0 for a row that only turns.
-        weights = [safe_sqrt((side[:, :, :3] ** 2).sum(2, keepdims=True)) for side in group.jacobian]
+        weights = [safe_sqrt(_square(side[:, :, :3])) for side in group.jacobian]
         parts = [_weighted(weight, half) for weight in weights]
         size = jnp.abs(impulse)
         if several:
             parts = [_with_movement(part, side, size, 0.0) for part, side in zip(parts, group.response, strict=True)]
-        total = add_scaled(group, tuple(parts), total, size)
+        total = add_changes(group, Dense((), tuple(parts)), total, size)
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
-        lever = group.lever[:, :, None]
-        share = _weighted(jnp.ones_like(lever), lever)
         if several:
-            none = [jnp.zeros_like(share)] * (impulse.shape[1] - 1)
-            share = jnp.concatenate([share, *none], axis=1)
             # Relative to half the step, contacts at rest add nothing at all.
-            parts = tuple(_with_movement(share, side, impulse, lever - half) for side in group.rows.response)
-            total = add_scaled(group.rows, parts, total, impulse)
+            movement = _Movement(group.rows.matrix.linear_responses(), group.lever, group.lever - half)
+            total = add_changes(group.rows, movement, total, impulse)
         else:
-            total = add_scaled(group.rows, (share,) * len(group.rows.jacobian), total, impulse[:, :1])
+            lever = group.lever[:, :, None]
+            share = _weighted(jnp.ones_like(lever), lever)
+            sides = len(group.rows.matrix.linear_responses())
+            total = add_changes(group.rows, Dense((), (share,) * sides), total, impulse[:, :1])
     mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
     return mean, _beyond(total[2:], mean - half, solved - free) if several else None
 
@@ -98,8 +100,36 @@ def _beyond(total: Array, mean: Array, change: Array) -> Vec3:
 def _with_movement(share: Array, response: Array, impulse: Array, lever: Array | float) -> Array:
     """Appends what makes, times the same impulse, its squared change of the velocity, and the change times the lever."""
     linear = response[:, :, :3]
-    squared = (linear**2).sum(2, keepdims=True) * impulse[:, :, None]
+    squared = _square(linear) * impulse[:, :, None]
     return jnp.concatenate([share, squared, linear * lever], axis=2)
+
+
+def _square(linear: Array) -> Array:
+    return add_slices(linear * linear, 2)[:, :, None]
+
+
+@pytree
+class _Movement:
+    """What the impulses of contacts add to the sums behind their bodies' levers, in the order of `_with_movement`.
+
+    Attributes:
+      linear: for each side, the linear part of the response, (turn, row, 3, column, world).
+      lever: (turn, 1, column, world) of each contact.
+      beyond: the same beyond half the step.
+    """
+
+    linear: tuple[Array, ...]
+    lever: Array
+    beyond: Array
+
+    def changes(self, impulse: Array, together: int) -> list[Array]:
+        weight, found = impulse[:1], []
+        for side in self.linear:
+            squared = add_slices(add_slices(side * side, 1) * (impulse * impulse), 0)
+            moved = add_slices(side * spread((impulse * self.beyond)[:, None], side.shape), 0)
+            terms = jnp.concatenate([weight, weight * self.lever, squared[None], moved])
+            found.append(sum_over_points(terms, together))
+        return found
 
 
 def _weighted(weight: Array, lever: Array) -> Array:

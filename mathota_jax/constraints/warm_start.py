@@ -11,6 +11,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.spread import add_slices
 from mathota_jax.spatial.vector import Vec3
 
 
@@ -72,10 +73,15 @@ def plausible(rows: tuple[Rows, ...], inertia: Inertia, velocity: Array, start: 
     change = add_impulses(rows, jnp.zeros_like(velocity), start)
     linear, angular = unpack_blocks(change)
     momentum = pack_blocks(linear * (1.0 / inertia.inverse_mass), None if angular is None else inertia.apply(angular))
-    slope = (velocity * momentum).sum((0, 1))
+    slope = _total(velocity * momentum)
     for group, impulse in zip(rows, start, strict=True):
-        slope = slope + (group.bias * impulse).sum((0, 1, 2))
-    curvature = (change * momentum).sum((0, 1))
+        slope = slope + _total(add_slices(group.bias * impulse, 1))
+    curvature = _total(change * momentum)
     worse = slope + 0.5 * curvature > 0
     scale = jnp.where(worse, jnp.clip(safe_divide(-slope, curvature), 0.0, 1.0), 1.0)
     return tuple(lax.stop_gradient(impulse * scale) for impulse in start)  # the start does not move the solution
+
+
+def _total(terms: Array) -> Array:
+    """Sum (world,) of (many, few, world): what XLA would make of both axes at once is a scalar loop."""
+    return add_slices(terms, 1).sum(0)

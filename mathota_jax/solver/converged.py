@@ -28,6 +28,7 @@ from jax import Array, lax
 from mathota_jax.solver import implicit, velocity_system
 from mathota_jax.solver.pgs import linearise
 from mathota_jax.solver.proximal import masses, slope, stiffen
+from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
 from mathota_jax.spatial.safe import safe_divide
 
@@ -152,7 +153,10 @@ class _Problem:
     def __init__(self, rows: tuple[Rows, ...], free: Array) -> None:
         self.rows, self.free = rows, free
         self.root = [jnp.sqrt(masses(group.law)) for group in rows]
-        size = [dataclasses.replace(group, jacobian=tuple(jnp.abs(j) for j in group.jacobian)) for group in rows]
+        size = [
+            dataclasses.replace(group, matrix=Dense(tuple(jnp.abs(j) for j in group.jacobian), group.response))
+            for group in rows
+        ]
         speed = _largest(r * row_velocity(s, jnp.abs(free)) for r, s in zip(self.root, size, strict=True))
         none = tuple(jnp.zeros_like(group.bias) for group in rows)
         scale = speed + self.residual(none, self.errors(free))

@@ -21,15 +21,15 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver.laws import Law
+from mathota_jax.solver.row_matrix import Dense, RowMatrix
 from mathota_jax.solver.rows import (
     UNROLLED_TURNS,
     Rows,
+    add_changes,
     add_impulses,
-    add_scaled,
     gather,
-    project,
+    matrix_velocity,
     receive,
-    respond,
     row_velocity,
 )
 from mathota_jax.solver.table import Table, TracedTable
@@ -94,7 +94,7 @@ def _sweep(
 ) -> tuple[Array, Array]:
     """One pass over the turns of a group."""
     table: Table | TracedTable = group.table
-    fixed = (group.jacobian, group.response, bias, coefficients)
+    fixed = (group.matrix, bias, coefficients)
     if isinstance(table, TracedTable):
         return _sweep_places(group, update, fixed, velocity, impulse)
     scanned = (*fixed, impulse)
@@ -127,9 +127,9 @@ def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, im
             lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), (places.blocks, (*fixed, impulse))
         )
         *values, old = values
-        _, response, *_ = values
+        matrix: RowMatrix = values[0]
         # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
-        old = store(old, response[0][:, 0])
+        old = store(old, matrix.like)
         velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, (*values, old))
         return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
 
@@ -141,15 +141,13 @@ def _turn(
     update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
 ) -> tuple[Array, Array]:
     """Solves the rows of one turn side by side."""
-    jacobian, response, bias, coefficients, impulse = values
-    error = bias
-    for side_jacobian, side_blocks in zip(jacobian, blocks, strict=True):
-        error = error + project(side_jacobian, gather(velocity, side_blocks, together))
+    matrix, bias, coefficients, impulse = values
+    error = bias + matrix.rates([gather(velocity, side, together) for side in blocks])
     # Stored, because each row of the law reads several errors, and every later turn the impulses: what is not stored is
     # computed again for each.
-    error = store(error, response[0][:, 0])
-    new = store(update(coefficients, impulse, error), response[0][:, 0])
-    return receive(velocity, receivers, [respond(side, new - impulse, together) for side in response]), new
+    error = store(error, matrix.like)
+    new = store(update(coefficients, impulse, error), matrix.like)
+    return receive(velocity, receivers, matrix.changes(new - impulse, together)), new
 
 
 @solve.defjvp
@@ -159,27 +157,38 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses)
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
+    rows, d_rows = _dense(rows, d_rows)
     d_velocity, jacobians, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     d_impulses = _solve_linear(gradient_iterations, rows, jacobians, right_sides)
     return (velocity, impulses), (add_impulses(rows, d_velocity, d_impulses), d_impulses)
 
 
+def _dense(rows: tuple[Rows, ...], d_rows: tuple[Rows, ...]) -> tuple[tuple[Rows, ...], tuple[Rows, ...]]:
+    """The rows and their change with all entries: the transposed system exchanges Jacobian and response."""
+    matrices, changes = (tuple(group.matrix for group in groups) for groups in (rows, d_rows))
+    dense = jax.jvp(lambda matrices: tuple(matrix.dense() for matrix in matrices), (matrices,), (changes,))
+    return tuple(  # type: ignore[return-value]
+        tuple(dataclasses.replace(group, matrix=matrix) for group, matrix in zip(groups, found, strict=True))
+        for groups, found in zip((rows, d_rows), dense, strict=True)
+    )
+
+
 def linearise(
     rows: tuple[Rows, ...], d_rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...], d_velocity: Array
 ) -> tuple[Array, tuple[tuple[Array, Array], ...], tuple[Array, ...]]:
-    """Derivative of the fixed point of all laws, but for the change of the impulses.
+    """Derivative of the fixed point of all laws, but for the change of the impulses. The matrices are dense.
 
     Returns:
       The change of the velocity at fixed impulses; for each group the Jacobians of its law with respect to impulse and
       error, and the change of its impulses at fixed impulses.
     """
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        d_velocity = add_scaled(group, d_group.response, d_velocity, impulse)
+        d_velocity = add_changes(group, d_group.matrix, d_velocity, impulse)
     jacobians, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
         error = group.bias + row_velocity(group, velocity)
         d_error = d_group.bias + row_velocity(group, d_velocity)
-        d_error = d_error + row_velocity(dataclasses.replace(group, jacobian=d_group.jacobian), velocity)
+        d_error = d_error + matrix_velocity(group.table, d_group.matrix, group.places, velocity)
         jacobians.append(_linearise(group.law, impulse, error))
         right_sides.append(
             jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023
@@ -211,7 +220,7 @@ def _solve_linear(
         swapped, coefficients = [], []
         for group, (by_impulse, by_error), side in zip(rows, jacobians, right_sides, strict=True):
             weighted = tuple(_weigh(jacobian, by_error) for jacobian in group.jacobian)
-            swapped.append(dataclasses.replace(group, jacobian=group.response, response=weighted))
+            swapped.append(dataclasses.replace(group, matrix=Dense(group.response, weighted)))
             coefficients.append((jnp.swapaxes(by_impulse, 1, 2), None, side))
         return _linear_sweeps(iterations, tuple(swapped), tuple(coefficients))
 

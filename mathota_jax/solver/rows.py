@@ -1,7 +1,7 @@
 """Rows of constraints, and their products with velocities and impulses.
 
 A row has a Jacobian and a response ``M^-1 J^T`` on one or two blocks of generalized velocity (a free body is a block of 6,
-or of 3 where nothing couples to rotation), a bias, and a law.
+or of 3 where nothing couples to rotation; see `row_matrix`), a bias, and a law.
 
 Layout: turn first, so that a turn is a contiguous slice; then row, component, column, world.
 """
@@ -9,19 +9,26 @@ Layout: turn first, so that a turn is a contiguous slice; then row, component, c
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver.laws import Law
+from mathota_jax.solver.row_matrix import RowMatrix
 from mathota_jax.solver.table import Table, TracedTable
-from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.settle import store
-from mathota_jax.spatial.spread import add_slices, spread
+from mathota_jax.spatial.spread import spread
 from mathota_jax.struct import pytree, static
+
+
+class Changes(Protocol):
+    """What `add_changes` needs of a matrix."""
+
+    def changes(self, impulse: Array, together: int) -> list[Array]: ...
+
 
 UNROLLED_TURNS = 12
 """Largest number of turns that a sweep unrolls."""
@@ -51,33 +58,28 @@ class Rows:
     """Rows that a table visits.
 
     Attributes:
-      jacobian: for each side, (turn, row, component, column, world).
-      response: for each side, ``M^-1 J^T``, same shape.
+      matrix: Jacobian and response, with leading turn axis.
       bias: (turn, row, column, world) constraint error at zero velocity.
       law: coefficients with leading turn axis.
       table: order of the sweep, a `Table` or a `TracedTable`.
       places: what a traced table leaves open; None for a static one.
     """
 
-    jacobian: tuple[Array, ...]
-    response: tuple[Array, ...]
+    matrix: RowMatrix
     bias: Array
     law: Law
     table: Any = static()
     places: Places | None = None
 
+    @property
+    def jacobian(self) -> tuple[Array, ...]:
+        """For each side, (turn, row, component, column, world)."""
+        return self.matrix.dense().jacobian
 
-def project(jacobian: Array, velocity: Array) -> Array:
-    """``J v``: (..., row, component, column, world) times (component, ..., column, world)."""
-    return add_slices(jacobian * spread(velocity[..., None, :, :, :], jacobian.shape), -3)
-
-
-def respond(response: Array, impulse: Array, together: int) -> Array:
-    """``M^-1 J^T`` times impulse, summed over the rows and columns of each constraint: (component, constraint, world)."""
-    total = add_slices(response * spread(impulse[..., None, :, :], response.shape), -4)
-    if together == 1:
-        return total
-    return functools.reduce(jnp.add, unstack(total.reshape(total.shape[0], -1, together, total.shape[-1]), 2))
+    @property
+    def response(self) -> tuple[Array, ...]:
+        """For each side, ``M^-1 J^T``, shape as the Jacobian."""
+        return self.matrix.dense().response
 
 
 def gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
@@ -130,64 +132,83 @@ def receive(velocity: Array, receivers: object, changes: list[Array]) -> Array:
 
 def row_velocity(group: Rows, velocity: Array) -> Array:
     """``J v`` of all rows of a group: (turn, row, column, world)."""
-    return _project_blocks(group.table, group.jacobian, group.places, velocity)
+    return matrix_velocity(group.table, group.matrix, group.places, velocity)
 
 
-def first_row_velocity(
-    table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
-) -> Array:
-    """``J v`` of the first row of each constraint, (turn, 1, column, world); arguments as in `Rows`."""
-    return _project_blocks(table, [side[:, :1] for side in jacobian], places, velocity)
+def first_row_velocity(group: Rows, velocity: Array) -> Array:
+    """``J v`` of the first row of each constraint, (turn, 1, column, world)."""
+    return matrix_velocity(group.table, group.matrix.first_row(), group.places, velocity)
 
 
-def _project_blocks(
-    table: Table | TracedTable, jacobian: Sequence[Array], places: Places | None, velocity: Array
-) -> Array:
+def matrix_velocity(table: Table | TracedTable, matrix: RowMatrix, places: Places | None, velocity: Array) -> Array:
+    """`row_velocity` for the parts of a group."""
     if isinstance(table, TracedTable):
         assert places is not None
         gathered = [jax.vmap(lambda b: gather(velocity, b, table.together))(blocks) for blocks in places.blocks]
     else:
         gathered = [_all_turns(velocity, blocks) for blocks in table.blocks]
-    return functools.reduce(jnp.add, [project(j, v) for j, v in zip(jacobian, gathered, strict=True)])
+    return matrix.rates(gathered)
 
 
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
     for group, impulse in zip(rows, impulses, strict=True):
-        velocity = add_scaled(group, group.response, velocity, impulse)
+        velocity = add_changes(group, group.matrix, velocity, impulse)
     return velocity
 
 
-def add_scaled(group: Rows, response: tuple[Array, ...], velocity: Array, impulse: Array) -> Array:
-    """Adds to each block the impulses of its rows times `response`.
+def add_changes(group: Rows, matrix: Changes, velocity: Array, impulse: Array) -> Array:
+    """Adds to each block what the impulses of the rows of a group change there, according to `matrix`.
 
-    That is, for each side, (turn, row, component, column, world); the components may be others than those of a velocity.
+    Its components may be others than those of a velocity.
     """
     table = group.table
     if group.places is not None:
-        return _add_at_places(group.places, table.together, response, velocity, impulse)
+        worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((velocity, impulse, matrix)))
+        return _add_at_places(table.together, group.places, matrix, in_every_world(velocity, worlds), impulse)
     if table.turn_count <= UNROLLED_TURNS:
-        by_turn = zip(*(unstack(side, 0) for side in response), unstack(impulse, 0), strict=True)
-        for turn, (*sides, values) in enumerate(by_turn):
-            changes = [respond(side, values, table.together) for side in sides]
-            velocity = receive(velocity, table.receivers[turn], changes)
+        for turn, (part, values) in enumerate(_by_turn((matrix, impulse), table.turn_count)):
+            velocity = receive(velocity, table.receivers[turn], part.changes(values, table.together))
         return velocity
 
     def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
-        receivers, sides, values = at_turn
-        return receive(velocity, receivers, [respond(side, values, table.together) for side in sides]), None
+        receivers, part, values = at_turn
+        return receive(velocity, receivers, part.changes(values, table.together)), None
 
-    return lax.scan(body, velocity, (jnp.asarray(table.receivers), response, impulse))[0]
+    return lax.scan(body, velocity, (jnp.asarray(table.receivers), matrix, impulse))[0]
 
 
-def _add_at_places(
-    places: Places, together: int, response: tuple[Array, ...], velocity: Array, impulse: Array
-) -> Array:
-    def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
-        blocks, sides, values = at_turn
-        return receive(velocity, blocks, [respond(side, values, together) for side in sides]), None
+def _by_turn(tree: Any, turn_count: int) -> list[Any]:
+    """The turns of a pytree of arrays (turn, ...)."""
+    leaves, structure = jax.tree.flatten(tree)
+    return [jax.tree.unflatten(structure, turn) for turn in zip(*(unstack(x, 0) for x in leaves), strict=True)]
 
-    return lax.scan(body, velocity, (places.blocks, response, impulse))[0]
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _add_at_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
+    """`add_changes` over those turns that hold a constraint; that loop has no reverse mode."""
+
+    def body(turn: Array, velocity: Array) -> Array:
+        at_turn = (places.blocks, matrix, impulse)
+        blocks, part, values = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), at_turn)
+        return receive(velocity, blocks, part.changes(values, together))
+
+    turns = impulse.shape[0] if places.turns is None else places.turns
+    return lax.fori_loop(0, turns, body, velocity)
+
+
+@_add_at_places.defjvp
+def _add_at_places_jvp(together: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    places, matrix, _, impulse = primals
+    _, d_matrix, d_velocity, d_impulse = tangents
+
+    def body(d_velocity: Array, at_turn: tuple) -> tuple[Array, None]:
+        blocks, values, d_values = at_turn
+        d_changes = jax.jvp(lambda part, impulse: part.changes(impulse, together), values, d_values)[1]
+        return receive(d_velocity, blocks, d_changes), None
+
+    scanned = (places.blocks, (matrix, impulse), (d_matrix, d_impulse))
+    return _add_at_places(together, *primals), lax.scan(body, d_velocity, scanned)[0]
 
 
 def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...]) -> Array:

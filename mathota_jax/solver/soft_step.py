@@ -367,7 +367,7 @@ def _rigid_law(group: _Group, carries: Array, lasting: Array | None) -> Any:
 def _first_row(group: _Group, velocity: Array) -> Array:
     """``J v`` of the first row of each constraint: (turn, 1, column, world)."""
     rows = group.rows
-    return first_row_velocity(rows.table, rows.jacobian, rows.places, velocity)
+    return first_row_velocity(rows, velocity)
 
 
 def _moved(group: _Group, displacement: Array, time: Array, dt: Array) -> Array:

@@ -1,0 +1,162 @@
+"""The matrices of rows, in two forms: their products with ``J`` and with ``M^-1 J^T``.
+
+Arrays have the axes (turn, row, component, column, world), or the same without the turn. A solver knows the products only;
+what a contact point stores is a third of its Jacobian and response, and the sweeps are bound by memory.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.bodies import InverseInertia
+from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.spread import add_slices, spread
+from mathota_jax.spatial.vector import Vec3
+from mathota_jax.struct import pytree
+
+
+@pytree
+class Dense:
+    """Any rows.
+
+    Attributes:
+      jacobian: for each side, all entries.
+      response: for each side, ``M^-1 J^T``, same shape.
+    """
+
+    jacobian: tuple[Array, ...]
+    response: tuple[Array, ...]
+
+    @property
+    def like(self) -> Array:
+        """A finite array (..., row, column, world)."""
+        return self.response[0][..., 0, :, :]
+
+    def rates(self, velocities: Sequence[Array]) -> Array:
+        """``J v``: (..., row, column, world) from the velocities (..., component, column, world) of each side."""
+        return functools.reduce(
+            jnp.add, [_along(side, velocity) for side, velocity in zip(self.jacobian, velocities, strict=True)]
+        )
+
+    def changes(self, impulse: Array, together: int) -> list[Array]:
+        """``M^-1 J^T p`` (component, constraint, world) of each side, summed over the rows and columns of a constraint."""
+        return [_sum(side, impulse, together) for side in self.response]
+
+    def linear_responses(self) -> tuple[Array, ...]:
+        """The first three components of the response of each side."""
+        return tuple(side[..., :3, :, :] for side in self.response)
+
+    def first_row(self) -> Dense:
+        """That of the first row of each constraint alone."""
+        return Dense(tuple(side[:, :1] for side in self.jacobian), tuple(side[:, :1] for side in self.response))
+
+    def dense(self) -> Dense:
+        return self
+
+
+@pytree
+class Points:
+    """Rows along directions at points of two bodies, or of one.
+
+    Attributes:
+      directions: in which side B moves against side A; of the only side with its sign.
+      angular: for each side, its sign times (arm x direction); none where nothing couples to rotation.
+      inertia: for each side, components (turn, constraint, world).
+    """
+
+    directions: Array
+    angular: tuple[Array, ...]
+    inertia: tuple[InverseInertia, ...]
+
+    @property
+    def like(self) -> Array:
+        """A finite array (..., row, column, world)."""
+        return self.directions[..., 0, :, :]
+
+    @property
+    def _signs(self) -> tuple[float, ...]:
+        return (-1.0, 1.0)[-len(self.inertia) :]
+
+    def rates(self, velocities: Sequence[Array]) -> Array:
+        """As `Dense.rates`."""
+        linear = velocities[-1][..., :3, :, :]
+        if len(velocities) == 2:
+            linear = linear - velocities[0][..., :3, :, :]
+        total = _along(self.directions, linear)
+        for side, velocity in zip(self.angular, velocities, strict=bool(self.angular)):
+            total = total + _along(side, velocity[..., 3:, :, :])
+        return total
+
+    def changes(self, impulse: Array, together: int) -> list[Array]:
+        """As `Dense.changes`."""
+        force = _sum(self.directions, impulse, together)
+        linear = [force * (sign * side.inverse_mass) for sign, side in zip(self._signs, self.inertia, strict=True)]
+        if not self.angular:
+            return linear
+        torques = [unstack(_sum(side, impulse, together), 0) for side in self.angular]
+        angular = [side.solve(Vec3(*torque)) for side, torque in zip(self.inertia, torques, strict=True)]
+        return [jnp.concatenate([moved, jnp.stack(turned)]) for moved, turned in zip(linear, angular, strict=True)]
+
+    def linear(self) -> tuple[Array, ...]:
+        """The first three components of the Jacobian of each side."""
+        return tuple(self.directions * sign for sign in self._signs)
+
+    def linear_responses(self) -> tuple[Array, ...]:
+        """As `Dense.linear_responses`."""
+        return tuple(
+            self.directions * (sign * self._of_columns(side.inverse_mass))
+            for sign, side in zip(self._signs, self.inertia, strict=True)
+        )
+
+    def angular_responses(self) -> tuple[Array, ...]:
+        """The last three components of the response of each side."""
+        found = []
+        for side, inertia in zip(self.angular, self.inertia, strict=bool(self.angular)):
+            components = unstack(side, -3)
+            like = components[0].shape
+            of_columns = jax.tree.map(lambda x, like=like: spread(self._of_columns(x)[..., 0, :, :], like), inertia)
+            found.append(jnp.stack(of_columns.solve(Vec3(*components)), axis=-3))
+        return tuple(found)
+
+    def first_row(self) -> Points:
+        """As `Dense.first_row`."""
+        return Points(self.directions[:, :1], tuple(side[:, :1] for side in self.angular), self.inertia)
+
+    def dense(self) -> Dense:
+        """The same rows with all entries."""
+        if not self.angular:
+            return Dense(self.linear(), self.linear_responses())
+
+        def join(linear: Sequence[Array], angular: Sequence[Array]) -> tuple[Array, ...]:
+            return tuple(jnp.concatenate(parts, axis=-3) for parts in zip(linear, angular, strict=True))
+
+        return Dense(join(self.linear(), self.angular), join(self.linear_responses(), self.angular_responses()))
+
+    def _of_columns(self, values: Array) -> Array:
+        """(..., 1, 1, column, world) from (..., constraint, world)."""
+        together = self.directions.shape[-2] // values.shape[-2]
+        return jnp.repeat(values, together, axis=-2)[..., None, None, :, :]
+
+
+RowMatrix = Dense | Points
+
+
+def _along(rows: Array, velocity: Array) -> Array:
+    return add_slices(rows * spread(velocity[..., None, :, :, :], rows.shape), -3)
+
+
+def _sum(rows: Array, impulse: Array, together: int) -> Array:
+    """(component, constraint, world) sum of (row, component, column, world) times the impulses (row, column, world)."""
+    return sum_over_points(add_slices(rows * spread(impulse[..., None, :, :], rows.shape), -4), together)
+
+
+def sum_over_points(values: Array, together: int) -> Array:
+    """(component, constraint, world) from (component, column, world)."""
+    if together == 1:
+        return values
+    return functools.reduce(jnp.add, unstack(values.reshape(values.shape[0], -1, together, values.shape[-1]), 2))
