@@ -21,7 +21,8 @@ from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.solver.laws import Bounded
-from mathota_jax.solver.rows import Rows, add_scaled, row_velocity
+from mathota_jax.solver.row_matrix import Dense
+from mathota_jax.solver.rows import Rows, add_changes, row_velocity
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once
@@ -56,7 +57,7 @@ def responses(links: mechanism.Links, joint_rows: Sequence[Rows], slots: tuple[i
     units = jnp.repeat(jnp.eye(count, dtype=links.offset.x.dtype), worlds, axis=1)
     impulse = jnp.zeros((6, block_count, count * worlds), units.dtype)
     for group, unit in zip(rows, _to_tables(rows, slots, units), strict=True):
-        impulse = add_scaled(group, group.jacobian, impulse, unit)
+        impulse = add_changes(group, Dense((), group.jacobian), impulse, unit)
     velocity = compute_once(mechanism.respond(tiled, impulse), impulse)
     matrix = of_slots(rows, slots, [row_velocity(group, velocity) for group in rows])
     shape = (count, worlds)

@@ -157,9 +157,12 @@ def arm(options=None, gravity=DOWN, motor=None, ends=None, **hinge):
 
 
 def test_friction_holds_an_arm_of_three_hinges(precision, gate):
-    """The load of the first hinge is ``0.5 g (0.15 + 0.45 + 0.75)``; 1.05 times that holds all three."""
+    """The load of the first hinge is ``0.5 g (0.15 + 0.45 + 0.75)``; 1.05 times that holds all three.
+
+    From nothing; with the default 10 sweeps it slips by 1.3e-3 rad in the first steps, and then holds.
+    """
     load = 0.5 * GRAVITY * sum(PLACES)
-    model, state = arm(friction=1.05 * load)
+    model, state = arm(undamped(dt=DT, velocity_iterations=40), friction=1.05 * load)
     final = advance(model, state, STEPS)
     gate("creep in 2 s [rad]", np.asarray(joint_position(model, final)), 1e-4)
 
