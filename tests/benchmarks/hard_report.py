@@ -1,8 +1,8 @@
 """The report of the hard scenes: ``python -m tests.benchmarks.hard_report [part of a name] [tier]``.
 
-Runs the cases whose name contains the first argument (all without one), keeps their figures in results/hard_scenes.json,
-beside those of earlier runs, and writes results/hard_scenes.md from everything that is kept. Float64: JAX_ENABLE_X64=1. One world; the cost is CPU time of the process after
-compilation, a mean over the whole run; compile time includes tracing.
+Runs the cases whose name contains the first argument (all without one), keeps their figures in results/hard_scenes.json
+beside those of earlier runs, and writes results/hard_scenes.md from everything that is kept. Float64: JAX_ENABLE_X64=1.
+One world; the cost is CPU time of the process after compilation, a mean over the whole run; compile time includes tracing.
 """
 
 from __future__ import annotations

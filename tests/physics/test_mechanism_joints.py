@@ -195,6 +195,7 @@ def test_arm_of_springs_and_dampers_is_that_of_mujoco(float64, gate):
     gate("angles - MuJoCo's [rad]", angle - np.array(truth), 5e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_of_both_modes_agree(float64, gate):
     """By the masses, through stops, friction and motors at work."""
     model, state = arm(
