@@ -206,10 +206,13 @@ def close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
 
 
 def stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:
-    """Fast bodies stop at the first touch on their way (guide 10.4)."""
+    """Fast bodies stop at the first touch on their way (guide 10.4), mechanisms as a whole."""
     scene = model.scene
     motion = events.Motion(bodies.position, bodies.orientation, *(of_all_bodies(scene, part) for part in displacement))
-    return moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved)))
+    trees = ()
+    if (found := layout(scene)) is not None:
+        trees = tuple(tuple(scene.dynamic_bodies[found.blocks[link]] for link in tree) for tree in found.trees)
+    return moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved), trees))
 
 
 def let_sleep(model: Model, old: State, new: State, action: Array, problem: Problem) -> State:

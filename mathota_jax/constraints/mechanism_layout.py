@@ -51,11 +51,16 @@ class Layout:
         return Tree(tuple(link.parent for link in self.links), tuple(floating))
 
     @functools.cached_property
-    def floating_trees(self) -> tuple[tuple[int, ...], ...]:
-        """The links of each tree that hangs on nothing; those of a tree follow one another."""
+    def trees(self) -> tuple[tuple[int, ...], ...]:
+        """The links of each tree, which follow one another."""
         starts = [place for place, link in enumerate(self.links) if link.parent == GROUND]
         ends = [*starts[1:], len(self.links)]
-        return tuple(tuple(range(a, b)) for a, b in zip(starts, ends, strict=True) if a in self.tree.floating)
+        return tuple(tuple(range(a, b)) for a, b in zip(starts, ends, strict=True))
+
+    @functools.cached_property
+    def floating_trees(self) -> tuple[tuple[int, ...], ...]:
+        """Those that hang on nothing."""
+        return tuple(links for links in self.trees if links[0] in self.tree.floating)
 
     @functools.cached_property
     def slots(self) -> tuple[int, ...]:
