@@ -13,6 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from mathota_jax import Box, Fixed, Hinge, SceneBuilder, Sphere, joint_gaps, joint_position, joint_velocity, rollout
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, GRAVITY, advance, record_worlds, repeat, undamped
 
 DT, STEPS = 1 / 240, 480
@@ -87,10 +88,12 @@ def of(precision, name):
     return DT * np.arange(1, STEPS + 1), record["angle"][:, hinges[name]], record["rate"][:, hinges[name]]
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_joints_stay_closed(precision, gate):
     gate("gap [m, rad]", recorded(str(precision))[1]["gap"], {"float32": 5e-6, "float64": 1e-12}[str(precision)])
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_spring_swings_the_whole_arm(precision, gate):
     """``1 - cos(w t)`` with the moment of the arm: a spring that saw two bodies alone would damp it by a twentieth."""
     time, angle, _ = of(precision, "oscillator")
@@ -98,6 +101,7 @@ def test_spring_swings_the_whole_arm(precision, gate):
     gate("last peak - 2", angle[-240:].max() - 2.0, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_dry_friction_takes_the_same_from_every_swing(precision, gate):
     """Each half cycle ends ``2 F / k`` short of where it would: the amplitude falls by ``4 F / k`` a cycle."""
     time, angle, _ = of(precision, "rubbing")
@@ -107,31 +111,37 @@ def test_dry_friction_takes_the_same_from_every_swing(precision, gate):
     gate("angle - truth [rad]", angle - truth, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_damper_stops_the_whole_arm(precision, gate):
     time, _, rate = of(precision, "viscous")
     gate("rate / truth - 1", rate / np.exp(-2.0 * time) - 1, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_brake_stops_the_whole_arm(precision, gate):
     time, _, rate = of(precision, "braked")
     gate("rate - truth [rad/s]", rate - np.maximum(1.0 - 0.8 * time, 0.0), 1e-4)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_friction_above_the_load_holds(precision, gate):
     _, angle, _ = of(precision, "held by friction")
     gate("creep in 2 s [rad]", angle, {"float32": 1e-4, "float64": 1e-8}[str(precision)])
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_velocity_motor_turns_the_whole_arm(precision, gate):
     time, _, rate = of(precision, "driven")
     gate("rate - truth [rad/s]", rate - np.minimum(0.5 * time, 0.6), 1e-4)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_servo_swings_the_whole_arm(precision, gate):
     time, angle, _ = of(precision, "servo")
     gate("angle - truth [rad]", angle - 0.4 * (1 - np.cos(OMEGA * time)), 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_stop_without_restitution(precision, gate):
     """The arm arrives at 1 rad/s after 0.5 s and stays."""
     time, angle, rate = of(precision, "stopped")
@@ -156,6 +166,7 @@ def arm(options=None, gravity=DOWN, motor=None, ends=None, **hinge):
     return builder.build(options or undamped(dt=DT))
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_friction_holds_an_arm_of_three_hinges(precision, gate):
     """The load of the first hinge is ``0.5 g (0.15 + 0.45 + 0.75)``; 1.05 times that holds all three.
 
@@ -214,6 +225,7 @@ def test_derivatives_of_both_modes_agree(float64, gate):
         gate("forward - reverse, relative", np.asarray(a - b) / np.abs(b).max(), 1e-9)
 
 
+@pytest.mark.slow
 def test_derivative_of_a_pendulum_in_forward_mode(float64, gate):
     """A welded arm swings from level; the angle after 0.8 s by gravity, from the variational equation."""
 

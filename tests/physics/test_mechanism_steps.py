@@ -25,6 +25,7 @@ from mathota_jax import (
     substep,
 )
 from mathota_jax import advance as advance_frame
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.physics.test_chain import TIPS, chain
 from tests.scenes import (
     DOWN,
@@ -67,6 +68,7 @@ def test_time_step_may_change(float64, gate):
     check_swing(gate, model, jax.lax.fori_loop(0, 60, cycle, state))
 
 
+@pytest.mark.slow
 def test_frames_and_substeps(float64, gate):
     """Frames of 1/50 s from steps of 1/240 s, and of 1/60 s from four sub-steps each."""
     model, state = chain(LINKS, dt=1 / 240)
@@ -81,6 +83,7 @@ def test_frames_and_substeps(float64, gate):
     check_swing(gate, model, jax.lax.fori_loop(0, 30, lambda _, s: substep(coarse, s), state))
 
 
+@pytest.mark.slow
 def test_a_broken_world_leaves_the_others_alone(precision):
     """One chain of four has a position, another a velocity that is NaN or infinite."""
     model, state = chain(4, dt=1 / 240)
@@ -110,6 +113,7 @@ def sleepy(**changes):
     return undamped(**{"dt": 1 / 60, "sleep": True, **changes})
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_chain_at_rest_sleeps_and_wakes_whole(precision, gate):
     """Four links hang still. Asleep they do not move a bit; a push of the lowest wakes them all, in the same step."""
     builder = SceneBuilder(gravity=DOWN)
@@ -134,6 +138,7 @@ def test_a_chain_at_rest_sleeps_and_wakes_whole(precision, gate):
     assert np.asarray(is_asleep(model, again)).sum() in (0, 4), "the chain sleeps and wakes as one"
 
 
+@pytest.mark.slow
 def test_a_ball_wakes_a_free_chain(precision, gate):
     """Three links adrift sleep until an elastic ball hits the end of them: the momentum is that of the ball."""
     builder = SceneBuilder(gravity=(0, 0, 0))
@@ -160,9 +165,9 @@ def test_a_ball_wakes_a_free_chain(precision, gate):
 # Fast bodies ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", [30.0, 180.0])
+@pytest.mark.parametrize("speed", [30.0, pytest.param(180.0, marks=pytest.mark.slow)])
 def test_a_fast_chain_does_not_pass_a_wall(speed, gate):
-    """Four balls in a row, jointed, fly at a wall half as thick as they are, at up to 15 of its thickness a step."""
+    """Four balls in a row, jointed, fly at a wall as thick as they are, at up to 15 times that a step."""
     builder = SceneBuilder(gravity=(0, 0, 0))
     builder.add_body(Box((0.1, 5.0, 5.0)), static=True)
     for k in range(4):
@@ -186,7 +191,7 @@ def test_a_fast_chain_does_not_pass_a_wall(speed, gate):
         repeat(model, 1), repeat(state, 1), 60,
         lambda model, state: {"x": state.position[1:, 0], "gap": joint_gaps(model, state).translation.max()},
     )  # fmt: skip
-    gate("past the near side of the wall [m]", np.maximum(np.asarray(record["x"]) + 0.2, 0.0), 0.05)
+    gate("centre of a ball inside the wall [m]", np.maximum(np.asarray(record["x"]) + 0.1, 0.0), 0.0)
     gate("gap / link", np.asarray(record["gap"]) / 0.3, 1e-3)
 
 
@@ -219,7 +224,9 @@ OVERCONSTRAINED = {
 }
 
 
-@pytest.mark.parametrize("case", OVERCONSTRAINED)
+@pytest.mark.parametrize(
+    "case", [case if case == "hinge twice" else pytest.param(case, marks=pytest.mark.slow) for case in OVERCONSTRAINED]
+)
 @pytest.mark.parametrize("precision", ["float32"], indirect=True)
 def test_a_loop_with_too_many_joints_stays_finite(precision, case, gate):
     """Rows that say the same twice, or what can not be: nothing is NaN, and no energy comes from nothing."""
@@ -239,6 +246,7 @@ def test_a_loop_with_too_many_joints_stays_finite(precision, case, gate):
         gate("gap [m]", np.asarray(record["gap"]), 1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sleep", [False, True])
 def test_a_loop_beside_a_tree_leaves_it_exact(precision, sleep, gate):
     """A four-bar linkage and a chain of four in one scene: the chain is a mechanism, the loop is swept."""
