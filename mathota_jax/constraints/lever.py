@@ -11,7 +11,7 @@ from jax import Array
 
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.scene import Scene
-from mathota_jax.solver.row_matrix import Dense, sum_over_points
+from mathota_jax.solver.row_matrix import Dense, RowMatrix, sum_over_points
 from mathota_jax.solver.rows import Rows, add_changes
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
@@ -74,7 +74,7 @@ def levers(
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
         if several:
             # Relative to half the step, contacts at rest add nothing at all.
-            movement = _Movement(group.rows.matrix.linear_responses(), group.lever, group.lever - half)
+            movement = _Movement(group.rows.matrix, group.lever, group.lever - half)
             total = add_changes(group.rows, movement, total, impulse)
         else:
             lever = group.lever[:, :, None]
@@ -110,21 +110,21 @@ def _square(linear: Array) -> Array:
 
 @pytree
 class _Movement:
-    """What the impulses of contacts add to the sums behind their bodies' levers, in the order of `_with_movement`.
+    """What the impulses of contacts add to the sums behind the levers of their bodies, in the order of `_with_movement`.
 
     Attributes:
-      linear: for each side, the linear part of the response, (turn, row, 3, column, world).
+      matrix: of the contacts.
       lever: (turn, 1, column, world) of each contact.
       beyond: the same beyond half the step.
     """
 
-    linear: tuple[Array, ...]
+    matrix: RowMatrix
     lever: Array
     beyond: Array
 
     def changes(self, impulse: Array, together: int) -> list[Array]:
         weight, found = impulse[:1], []
-        for side in self.linear:
+        for side in self.matrix.linear_responses():
             squared = add_slices(add_slices(side * side, 1) * (impulse * impulse), 0)
             moved = add_slices(side * spread((impulse * self.beyond)[:, None], side.shape), 0)
             terms = jnp.concatenate([weight, weight * self.lever, squared[None], moved])

@@ -33,6 +33,7 @@ from mathota_jax.solver.rows import (
     row_velocity,
 )
 from mathota_jax.solver.table import Table, TracedTable
+from mathota_jax.spatial import counter
 from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
 
@@ -121,20 +122,18 @@ def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, im
     places = group.places
     assert places is not None
 
-    def body(turn: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        velocity, impulse = carry
-        blocks, values = jax.tree.map(
-            lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), (places.blocks, (*fixed, impulse))
-        )
+    def body(_: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        turn, velocity, impulse = carry
+        blocks, values = counter.row((places.blocks, (*fixed, impulse)), turn)
         *values, old = values
         matrix: RowMatrix = values[0]
         # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
         old = store(old, matrix.like)
         velocity, new = _turn(update, group.table.together, velocity, blocks, blocks, (*values, old))
-        return velocity, lax.dynamic_update_index_in_dim(impulse, new, turn, 0)
+        return counter.following(turn), velocity, counter.put(impulse, new, turn)
 
     turns = group.table.turn_count if places.turns is None else places.turns
-    return lax.fori_loop(0, turns, body, (velocity, impulse))
+    return lax.fori_loop(0, turns, body, (counter.start(), velocity, impulse))[1:]
 
 
 def _turn(

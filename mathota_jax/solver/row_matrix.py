@@ -15,6 +15,7 @@ from jax import Array
 
 from mathota_jax.bodies import InverseInertia
 from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.settle import store
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.struct import pytree
@@ -94,11 +95,13 @@ class Points:
 
     def changes(self, impulse: Array, together: int) -> list[Array]:
         """As `Dense.changes`."""
-        force = _sum(self.directions, impulse, together)
+        # Stored, since every component of a change needs all of them, in different ways.
+        like = self.directions[0, :, ::together]
+        force = store(_sum(self.directions, impulse, together), like)
         linear = [force * (sign * side.inverse_mass) for sign, side in zip(self._signs, self.inertia, strict=True)]
         if not self.angular:
             return linear
-        torques = [unstack(_sum(side, impulse, together), 0) for side in self.angular]
+        torques = [unstack(store(_sum(side, impulse, together), like), 0) for side in self.angular]
         angular = [side.solve(Vec3(*torque)) for side, torque in zip(self.inertia, torques, strict=True)]
         return [jnp.concatenate([moved, jnp.stack(turned)]) for moved, turned in zip(linear, angular, strict=True)]
 

@@ -18,6 +18,7 @@ from jax import Array, lax
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import RowMatrix
 from mathota_jax.solver.table import Table, TracedTable
+from mathota_jax.spatial import counter
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.settle import store
 from mathota_jax.spatial.spread import spread
@@ -188,13 +189,13 @@ def _by_turn(tree: Any, turn_count: int) -> list[Any]:
 def _add_at_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
     """`add_changes` over those turns that hold a constraint; that loop has no reverse mode."""
 
-    def body(turn: Array, velocity: Array) -> Array:
-        at_turn = (places.blocks, matrix, impulse)
-        blocks, part, values = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, turn, 0, keepdims=False), at_turn)
-        return receive(velocity, blocks, part.changes(values, together))
+    def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        turn, velocity = carry
+        blocks, part, values = counter.row((places.blocks, matrix, impulse), turn)
+        return counter.following(turn), receive(velocity, blocks, part.changes(values, together))
 
     turns = impulse.shape[0] if places.turns is None else places.turns
-    return lax.fori_loop(0, turns, body, velocity)
+    return lax.fori_loop(0, turns, body, (counter.start(), velocity))[1]
 
 
 @_add_at_places.defjvp

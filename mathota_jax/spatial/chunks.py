@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -36,21 +37,49 @@ def map_filled(function: Callable[[Any], Any], tree: Any, filled: Array) -> Any:
         return values.reshape(chunk_count, size, *values.shape[1:])
 
     chunks = jax.tree.map(split, tree)
-    shapes = jax.eval_shape(evaluate, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), chunks))
-
-    def empty(_: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def body(first: Array, rows: Any) -> tuple[Array, Any]:
-        return first + size, lax.cond(first < filled, evaluate, empty, rows)
-
-    _, results = lax.scan(body, jnp.zeros((), filled.dtype), chunks)
+    example = jax.tree.map(lambda x: x[0], chunks)
+    converted, constants = jax.closure_convert(evaluate, example)
+    results = _map_chunks(converted, constants, chunks, -(-filled // size))
 
     def join(values: Array) -> Array:
         rows_of_one = values.shape[1] // size
         return values.reshape(-1, *values.shape[2:])[: count * rows_of_one]
 
     return jax.tree.map(join, results)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used: Array) -> Any:
+    """`function(chunk, *constants)` of the chunks in use, stacked, and 0 elsewhere."""
+
+    def body(k: Array, results: Any) -> Any:
+        chunk = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, 0, keepdims=False), chunks)
+        return jax.tree.map(
+            lambda all_, x: lax.dynamic_update_index_in_dim(all_, x, k, 0), results, function(chunk, *constants)
+        )
+
+    count = jax.tree.leaves(chunks)[0].shape[0]
+    shapes = jax.eval_shape(lambda chunks: function(jax.tree.map(lambda x: x[0], chunks), *constants), chunks)
+    zeros = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), shapes)
+    return lax.fori_loop(0, used, body, zeros)
+
+
+@_map_chunks.defjvp
+def _map_chunks_jvp(function: Callable[..., Any], primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+    """A loop over the chunks in use has no reverse mode; one that passes over the others has."""
+
+    def every_chunk(constants: Any, chunks: Any, used: Array) -> Any:
+        def evaluate(chunk: Any) -> Any:
+            return function(chunk, *constants)
+
+        def body(k: Array, chunk: Any) -> tuple[Array, Any]:
+            shapes = jax.eval_shape(evaluate, chunk)
+            empty = lambda _: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)  # noqa: E731
+            return k + 1, lax.cond(k < used, evaluate, empty, chunk)
+
+        return lax.scan(body, jnp.zeros((), used.dtype), chunks)[1]
+
+    return jax.jvp(every_chunk, primals, tangents)
 
 
 def _chunk_count(count: int) -> int:
