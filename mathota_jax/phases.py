@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
-from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, motor
-from mathota_jax.constraints.mechanism_layout import covers, layout
+from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, mechanism_rows, motor
+from mathota_jax.constraints.mechanism_layout import bounded_slots, covers, covers_with_bounds, layout
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import carried_velocity, free_velocity
@@ -75,12 +75,38 @@ def solve_rows(
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
     if problem.held is None:
         return _sweep(scene, rows, velocity, start, known)
-    hold = functools.partial(mechanism.hold, problem.held, problem.joint_rows)
+    return _solve_mechanisms(scene, problem, problem.held, velocity, start)
+
+
+def _solve_mechanisms(
+    scene: Scene, problem: Problem, held: mechanism.Links, velocity: Array, start: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...], Array | None]:
+    """`solve_rows` where there are mechanisms: what they hold, holds exactly in the end."""
+    rows = problem.rows
+    hold = functools.partial(mechanism.hold, held, problem.joint_rows)
     if covers(scene):
         return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
-    _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
-    velocity, impulses, failed = _sweep(scene, rows, velocity, start, known=False)
-    return *hold(velocity, impulses), failed
+    responses = problem.responses if scene.options.solver == "pgs" else None
+    bounded = () if responses is None else bounded_slots(scene)
+    failed, joint_count = None, len(problem.joint_rows)
+    if responses is not None and covers_with_bounds(scene):
+        start, impulses = lax.stop_gradient(start), tuple(jnp.zeros_like(impulse) for impulse in start)
+    else:
+        _, start = lax.stop_gradient(hold(add_impulses(rows, velocity, start), start))
+        velocity, impulses, failed = _sweep(scene, rows, velocity, start, known=False)
+        start = impulses
+    velocity, impulses = hold(velocity, impulses)
+    if responses is None:
+        return velocity, impulses, failed
+    sweeps = scene.options.velocity_iterations
+    joints, others = impulses[:joint_count], impulses[joint_count:]
+    moved, change = mechanism_rows.solve(
+        responses, problem.joint_rows, bounded, sweeps, velocity, joints, start[:joint_count]
+    )
+    # What the joints take for it; the velocity is known better.
+    joints = tuple(old + more for old, more in zip(joints, change, strict=True))
+    _, joints = hold(add_impulses(problem.joint_rows, velocity, change), joints)
+    return moved, (*joints, *others), failed
 
 
 def _sweep(
@@ -123,11 +149,18 @@ def correct_positions(
         return moved
     packed = contact.pack_motion(scene, *displacement)
     rows: list[Rows] = []
+    back = None
     if problem.joints is not None:
         error = joint_rows.joint_rows(model, merge(scene, bodies, moved)).error
+        bounded = () if problem.responses is None else bounded_slots(scene)
         rows += [
-            joint.position_rows(scene, group.table, problem.joints, error, inertia) for group in problem.joint_rows
+            joint.position_rows(scene, group.table, problem.joints, error, inertia, bounded)
+            for group in problem.joint_rows
         ]
+        if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
+            back = mechanism_rows.leave_stops(
+                problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
+            )
     for group in problem.contact_rows:
         change = first_row_velocity(group.rows, packed)
         rows.append(contact.position_rows(group, change, options.position_percent))
@@ -135,10 +168,11 @@ def correct_positions(
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
     if options.solver == "converged":
-        return displace(moved, inertia, converged.solve(tuple(rows), zero, start)[0])
+        correction = converged.solve(tuple(rows), zero, start)[0]
+        return displace(moved, inertia, correction if back is None else correction + back)
     iterations = options.position_iterations
     correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
-    return displace(moved, inertia, correction)
+    return displace(moved, inertia, correction if back is None else correction + back)
 
 
 def close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
@@ -172,10 +206,13 @@ def close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
 
 
 def stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:
-    """Fast bodies stop at the first touch on their way (guide 10.4)."""
+    """Fast bodies stop at the first touch on their way (guide 10.4), mechanisms as a whole."""
     scene = model.scene
     motion = events.Motion(bodies.position, bodies.orientation, *(of_all_bodies(scene, part) for part in displacement))
-    return moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved)))
+    trees = ()
+    if (found := layout(scene)) is not None:
+        trees = tuple(tuple(scene.dynamic_bodies[found.blocks[link]] for link in tree) for tree in found.trees)
+    return moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved), trees))
 
 
 def let_sleep(model: Model, old: State, new: State, action: Array, problem: Problem) -> State:

@@ -166,10 +166,10 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
     moved, displacement = compute_once((moved, displacement), state.position)
     if scene.options.solver != "soft_step":
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)
-    if problem.held is not None:
-        moved = close_joints(model, bodies, moved)
     if scene.options.continuous and scene.pair_groups:
         moved = stop_at_impacts(model, bodies, moved, displacement)
+    if problem.held is not None:
+        moved = close_joints(model, bodies, moved)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
     return let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 

@@ -8,6 +8,10 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
+    "tests/physics/test_mechanism_steps.py::test_a_loop_with_too_many_joints_stays_finite[float32-rod that can not reach]": (
+        "a closed loop whose rows contradict each other (a rod 1.6 m longer than the linkage can reach) gains speed without "
+        "bound and is NaN after 34 steps of 1/240 s; Flag.NON_FINITE is set. Loops whose rows agree stay finite and closed"
+    ),
     "tests/physics/test_soft_step.py::test_chain_holds[10]": "the whip of the free end opens a joint by 1.41 % of a link "
     "for one step of 600, gate 1 %",
     "tests/physics/test_soft_step.py::test_stack_stands[40]": "forty cubes stand, but lean by 0.20 m, gate 10 mm: with a "

@@ -14,7 +14,8 @@ from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sid
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
-from mathota_jax.constraints.mechanism_layout import layout
+from mathota_jax.constraints.mechanism_layout import bounded_slots, layout
+from mathota_jax.constraints.mechanism_rows import Responses, own_mass
 from mathota_jax.constraints.row_coefficients import Coefficients
 from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
 from mathota_jax.model import Model
@@ -38,12 +39,14 @@ class JointMotion(NamedTuple):
       middle: rows at the middle of the step, whose Jacobians are used.
       coefficients: of the laws.
       inertia: of the moving bodies.
+      responses: to the rows with bounds of mechanisms; None where there are none.
     """
 
     start: JointRows
     middle: JointRows
     coefficients: Coefficients
     inertia: Inertia
+    responses: Responses | None = None
 
 
 def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
@@ -55,7 +58,8 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
     if (mechanisms := layout(scene)) is not None and scene.options.position_iterations:
         # They are closed at the end of each step; an error turned into velocity would whip a chain that starts open.
         error = jnp.where(np.isin(slots, mechanisms.slots)[:, None], 0.0, error)
-    columns = Columns(mass, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
+    felt = mass if motion.responses is None else _with_trees(scene, slots, mass, motion.responses)
+    columns = Columns(felt, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
     found = {law: LAWS[law](columns) for law in sorted(set(laws.tolist()))}
 
     def of_each(name: str) -> Any:
@@ -78,6 +82,17 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
     return _pack(table, jacobians, responses, bias, law, worlds)
 
 
+def _with_trees(scene: Scene, slots: np.ndarray, mass: Array, responses: Responses) -> Array:
+    """``J M^-1 J^T`` of columns, for the rows of mechanisms with all that hangs on their joints.
+
+    A spring that saw two bodies alone would take a heavy arm for a fast oscillator, and damp it.
+    """
+    bounded = bounded_slots(scene)
+    inside = np.isin(slots, bounded)
+    own = own_mass(responses.matrix, mass, [bounded.index(slot) if slot in bounded else 0 for slot in slots.tolist()])
+    return own if inside.all() else jnp.where(inside[:, None], own, mass)
+
+
 def _by_law(laws: np.ndarray, values: dict[str, Any]) -> Any:
     """Selects for each column (column, world) the value of its law."""
     names = iter(values)
@@ -95,14 +110,17 @@ def _pack_bound(table: Table, bound: Any, worlds: int) -> Array:
     return columns.reshape(table.turn_count, 1, len(table.slots[0]), 1)
 
 
-def position_rows(scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia) -> Rows:
-    """Rows of one table for the position correction; `error` (slot, world) is that after the step."""
+def position_rows(
+    scene: Scene, table: Table, joints: JointRows, error: Array, inertia: Inertia, left_out: tuple[int, ...] = ()
+) -> Rows:
+    """Rows of one table for the position correction, void in slots `left_out`; `error` (slot, world) after the step."""
     jacobians, responses, mass = _sides(scene, table, joints, inertia)
-    laws = joints.laws[np.maximum(table.order, 0)]
+    slots = np.maximum(table.order, 0)
+    laws = joints.laws[slots]
     one_sided = laws == STOP
     error = select(table, error)
     worlds = max(mass.shape[-1], error.shape[-1])
-    free = np.where(np.isin(laws, CORRECTED), np.inf, 0.0)
+    free = np.where(np.isin(laws, CORRECTED) & ~np.isin(slots, left_out), np.inf, 0.0)
     law = Bounded(
         effective_mass=jax.lax.stop_gradient(pack_scalars(table, [1.0 / mass], worlds)),
         softness=_bounds(table, np.zeros(one_sided.shape)),

@@ -26,7 +26,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver import tree
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
-from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
@@ -249,6 +249,36 @@ def _impulses(links: Links, wanted: Impulses) -> Impulses:
     for side, impulse in zip(translations, linear, strict=True):
         about = about - side.angular * impulse
     return _held(links, [*linear, *(dot(dual, about) for dual in duals[1])])
+
+
+def respond(links: Links, impulse: Array) -> Array:
+    """Velocities (component, block, world) under impulses on the bodies, likewise, with the joints held.
+
+    Differentiable in both modes.
+    """
+    return _respond(links, impulse)
+
+
+@jax.custom_jvp
+def _respond(links: Links, impulse: Array) -> Array:
+    of_links = take(unpack_blocks(impulse), links.layout.blocks)
+    worlds = max(impulse.shape[-1], links.factors.offset.shape[-1])
+    motion = tree.respond(links.layout.tree, links.factors, in_every_world(_pack(*of_links), worlds))
+    return _to_blocks(links.layout, pack_blocks(*_unpack(motion)))
+
+
+@_respond.defjvp
+def _respond_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    found = _respond(*primals)
+
+    def again(links: Links, impulse: Array) -> Array:
+        """The same from the bodies alone, whose motion along the rows is taken back."""
+        force, torque = take(unpack_blocks(impulse), links.layout.blocks)
+        alone = pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque))
+        excess = _to_blocks(links.layout, alone) - found
+        return excess + push(links, solve(links, jax.tree.map(jnp.negative, rates(links, excess))))
+
+    return found, jax.jvp(again, primals, tangents)[1]
 
 
 def _combine(directions: tuple[Vec3, ...], values: Impulses) -> Vec3:

@@ -51,11 +51,16 @@ class Layout:
         return Tree(tuple(link.parent for link in self.links), tuple(floating))
 
     @functools.cached_property
-    def floating_trees(self) -> tuple[tuple[int, ...], ...]:
-        """The links of each tree that hangs on nothing; those of a tree follow one another."""
+    def trees(self) -> tuple[tuple[int, ...], ...]:
+        """The links of each tree, which follow one another."""
         starts = [place for place, link in enumerate(self.links) if link.parent == GROUND]
         ends = [*starts[1:], len(self.links)]
-        return tuple(tuple(range(a, b)) for a, b in zip(starts, ends, strict=True) if a in self.tree.floating)
+        return tuple(tuple(range(a, b)) for a, b in zip(starts, ends, strict=True))
+
+    @functools.cached_property
+    def floating_trees(self) -> tuple[tuple[int, ...], ...]:
+        """Those that hang on nothing."""
+        return tuple(links for links in self.trees if links[0] in self.tree.floating)
 
     @functools.cached_property
     def slots(self) -> tuple[int, ...]:
@@ -108,6 +113,33 @@ def covers(scene: Scene) -> bool:
     """Whether the scene has no other rows than those that mechanisms hold."""
     found = layout(scene)
     return found is not None and not scene.slot_count and len(found.slots) == joint_row_count(scene)
+
+
+def covers_with_bounds(scene: Scene) -> bool:
+    """Whether it has no others than those and rows with bounds on mechanisms."""
+    found = layout(scene)
+    if found is None or scene.slot_count:
+        return False
+    return len(found.slots) + len(bounded_slots(scene)) == joint_row_count(scene)
+
+
+@functools.cache
+def bounded_slots(scene: Scene) -> tuple[int, ...]:
+    """Slots of the rows with bounds, or soft ones, that act on nothing but links."""
+    found = layout(scene)
+    if found is None:
+        return ()
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    links = set(found.blocks)
+    slots = [
+        group.slots(row).start + place
+        for group in joint_groups(scene)
+        for place, joint in enumerate(group.joints)
+        for row in range(group.row_count)
+        if {block_of[body] for body in (scene.joints[joint].parent, scene.joints[joint].child) if body in block_of}
+        <= links
+    ]
+    return tuple(sorted(set(slots) - set(found.slots)))
 
 
 def _held_slots(group: JointGroup, place: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

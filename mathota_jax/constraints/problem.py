@@ -17,6 +17,7 @@ from mathota_jax.constraints import (
     joint_rows,
     mechanism,
     mechanism_layout,
+    mechanism_rows,
     row_coefficients,
     substep_rows,
     warm_start,
@@ -40,11 +41,13 @@ class Forces(NamedTuple):
 class Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
 
-    `held` are the mechanisms at the middle of the step; `errors` are those of all groups, for the small steps alone.
+    `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of
+    all groups, for the small steps alone.
     """
 
     joints: joint_rows.JointRows | None
     held: mechanism.Links | None
+    responses: mechanism_rows.Responses | None
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
     contact_rows: list[contact.ContactRows]
@@ -80,7 +83,7 @@ def constrain(
     """
     scene = model.scene
     small_steps = scene.options.solver == "soft_step"
-    joints, held, tables, errors = None, None, (), ()
+    joints, held, responses, tables, errors = None, None, None, (), ()
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
         halfway = joint_rows.moved_by(bodies, 0.5 * model.dt)
@@ -93,6 +96,10 @@ def constrain(
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
         rows_of = substep_rows.joint_rows if small_steps else joint.velocity_rows
         tables = tuple(rows_of(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene))
+        if held is not None and (bounded := mechanism_layout.bounded_slots(scene)):
+            responses = mechanism_rows.responses(held, tables, bounded)
+            joint_motion = joint_motion._replace(responses=responses)
+            tables = tuple(rows_of(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene))
         if small_steps:
             errors = tuple(substep_rows.joint_error(scene, rows, model, joint_motion) for rows in tables)
     contacts, contact_rows, close = None, [], None
@@ -123,7 +130,7 @@ def constrain(
         ]
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
-    return Problem(joints, held, tables, contacts, contact_rows, close, errors)
+    return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors)
 
 
 def starting_impulses(

@@ -9,6 +9,7 @@ them (E. Catto, "Continuous Collision", GDC 2013).
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -70,13 +71,14 @@ class _Pairs(NamedTuple):
     size: Array
 
 
-def stop_at_impacts(model: Model, motion: Motion, moved: Bodies) -> Bodies:
+def stop_at_impacts(model: Model, motion: Motion, moved: Bodies, trees: tuple[tuple[int, ...], ...] = ()) -> Bodies:
     """Bodies at the end of the step, those that hit something at speed where they do.
 
     Args:
       model: parameters and static scene.
       motion: of all bodies in this step, static ones included.
       moved: all bodies at the end of the step.
+      trees: bodies that stop together, since joints hold them together.
 
     Returns:
       `moved` with other positions and orientations. Differentiable: the share of the motion that is made is that of the
@@ -87,7 +89,8 @@ def stop_at_impacts(model: Model, motion: Motion, moved: Bodies) -> Bodies:
     fast = jnp.asarray(False)
     for group in model.scene.pair_groups:
         fast = fast | _fast(_pairs(model, group, motion)).any()
-    share = lax.cond(fast, _shares, lambda model, motion, full: full, model, motion, full)
+    shares = functools.partial(_shares, trees)
+    share = lax.cond(fast, shares, lambda model, motion, full: full, model, motion, full)
     stops = settle(jnp.where(share < 1, 1.0, 0.0)) > 0.5
     position, orientation = motion.at(share)
 
@@ -100,7 +103,7 @@ def stop_at_impacts(model: Model, motion: Motion, moved: Bodies) -> Bodies:
     )
 
 
-def _shares(model: Model, motion: Motion, full: Array) -> Array:
+def _shares(trees: tuple[tuple[int, ...], ...], model: Model, motion: Motion, full: Array) -> Array:
     """(body, world) share of its motion that each body makes."""
     groups = model.scene.pair_groups
     fixed_model, fixed_motion = lax.stop_gradient((model, motion))
@@ -111,15 +114,20 @@ def _shares(model: Model, motion: Motion, full: Array) -> Array:
         share = old
         for group, pairs in zip(groups, fixed, strict=True):
             share = _lower(group, share, _first_touch(fixed_model, group, pairs, share))
+        for tree in trees:
+            share = share.at[np.asarray(tree)].set(take(share, tree).min(0))
         return share, (share != old).any(), count + 1
 
     start = (full, jnp.asarray(True), jnp.asarray(0))
     share = lax.while_loop(lambda state: state[1] & (state[2] < ROUNDS), one_round, start)[0]
     # One Newton step of the root: no change of the value, the exact derivative (implicit function theorem).
-    result = share
+    change = jnp.zeros_like(share)
     for group in groups:
-        result = result + _differential(group, _newton_step(model, group, _pairs(model, group, motion), share), share)
-    return result
+        change = change + _differential(group, _newton_step(model, group, _pairs(model, group, motion), share), share)
+    for tree in trees:
+        # Of the body that touches: 0 for the others.
+        change = change.at[np.asarray(tree)].set(take(change, tree).sum(0))
+    return share + change
 
 
 def _pairs(model: Model, group: PairGroup, motion: Motion) -> _Pairs:

@@ -118,8 +118,20 @@ def force_for(tree: Tree, factors: Factors, jump: Pair) -> Pair:
       tree, factors: structure and what `factorize` gives.
       jump: motion of each link relative to its parent, but for any sum of its columns.
     """
-    worlds = max(jump[0].shape[-1], factors.offset.shape[-1])
-    jump = in_every_world(jump, worlds)
+    jump = in_every_world(jump, max(jump[0].shape[-1], factors.offset.shape[-1]))
+    # Any motion that has the jumps; then the one of least energy among those that differ by columns.
+    wanted = follow(tree, factors.offset, jump)
+    released = respond(tree, factors, jax.tree.map(jnp.negative, _momentum(factors.masses, wanted)))
+    momentum = _momentum(factors.masses, _add_scaled(wanted, released, 1.0))
+    return _inward(tree, lambda force, across: (_onto_parent(force, across), force), momentum, factors.offset)
+
+
+def respond(tree: Tree, factors: Factors, impulse: Pair) -> Pair:
+    """Motions of the links under impulses on them, along which their joints hold.
+
+    Nothing that the joints take back is ever computed, as it would be from the motion of the link alone, which may be
+    thousands of times larger.
+    """
     columns = (factors.columns, factors.forces, factors.compliance)
 
     def gather(force: Pair, link: tuple) -> tuple[Pair, tuple]:
@@ -142,17 +154,15 @@ def force_for(tree: Tree, factors: Factors, jump: Pair) -> Pair:
             own = _add_scaled(own, column, -rate)
         return own
 
-    # Any motion that has the jumps; then the one of least energy among those that differ by columns.
-    wanted = follow(tree, factors.offset, jump)
-    errors, whole = _inward(tree, gather, _momentum(factors.masses, wanted), (factors.offset, *columns))
-    start = jax.tree.map(jnp.zeros_like, jump)
+    bias = jax.tree.map(jnp.negative, impulse)
+    errors, whole = _inward(tree, gather, bias, (factors.offset, *columns))
+    start = jax.tree.map(jnp.zeros_like, bias)
     if tree.floating:
         places = np.asarray(tree.floating)
-        roots = _solve_roots(factors.roots, jax.tree.map(lambda x: x[places], whole))
+        inertia = in_every_world(factors.roots, bias[0].shape[-1])
+        roots = _solve_roots(inertia, jax.tree.map(lambda x: x[places], whole))
         start = jax.tree.map(lambda x, root: x.at[places].set(-root), start, roots)
-    released = _outward(tree, release, start, (factors.offset, *columns, errors, start))
-    momentum = _momentum(factors.masses, _add_scaled(wanted, released, 1.0))
-    return _inward(tree, lambda force, across: (_onto_parent(force, across), force), momentum, factors.offset)
+    return _outward(tree, release, start, (factors.offset, *columns, errors, start))
 
 
 def follow(tree: Tree, offset: Array, jump: Pair) -> Pair:

@@ -1,14 +1,14 @@
 """The report of the hard scenes: ``python -m tests.benchmarks.hard_report [part of a name] [tier]``.
 
-Runs the cases whose name contains the first argument (all without one), keeps their figures in results/hard_scenes.json,
-and writes results/hard_scenes.md from everything that is kept. One world; the cost is CPU time of the process after
-compilation, a mean over the whole run; compile time includes tracing.
+Runs the cases whose name contains the first argument (all without one), keeps their figures in results/hard_scenes.json
+beside those of earlier runs, and writes results/hard_scenes.md from everything that is kept. Float64: JAX_ENABLE_X64=1.
+One world; the cost is CPU time of the process after compilation, a mean over the whole run; compile time includes tracing.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tests.benchmarks.hard_cases import CASES, Case, as_run, simulate
+from tests.benchmarks.hard_cases import CASES, TIERS, Case, as_run, simulate
 
 RESULTS = Path(__file__).parent / "results"
 HEADER = """# Hard scenes
@@ -87,7 +87,11 @@ def _cell(value: float | str, gate: float | None) -> str:
 
 def main() -> None:
     """Runs what the arguments choose."""
-    part, only = [*sys.argv[1:], "", ""][:2]
+    parser = argparse.ArgumentParser(prog="hard_report", description=__doc__)
+    parser.add_argument("part", nargs="?", default="", help="of the name of a case; all cases without one")
+    parser.add_argument("tier", nargs="?", default="", choices=("", *TIERS), help="all of each case without one")
+    arguments = parser.parse_args()
+    part, only = arguments.part, arguments.tier
     path = RESULTS / "hard_scenes.json"
     programs: dict[Any, Any] = {}
     for case in CASES:

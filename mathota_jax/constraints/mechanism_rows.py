@@ -1,0 +1,186 @@
+"""Rows with bounds on the joints of mechanisms: limits, motors, springs, friction, solved with all that hangs on them.
+
+An impulse of such a row moves the whole tree. Swept like rows of two free bodies, in turn with the rows that hold, it finds
+the inertia of the tree only after as many sweeps as the tree is heavier than the two: a stop throws the arm back, and what
+friction should hold creeps. Here the response of the tree to each row is found first (`solver.tree`, all rows side by side
+as if they were worlds), and the sweeps run over the small dense matrix of the rows, in which the joints hold throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from mathota_jax.constraints import mechanism
+from mathota_jax.constraints.assembly import collect, pack_scalars, select
+from mathota_jax.constraints.joint_rows import JointRows
+from mathota_jax.constraints.joints.rows import STOP
+from mathota_jax.solver.laws import Bounded
+from mathota_jax.solver.row_matrix import Dense
+from mathota_jax.solver.rows import Rows, add_changes, row_velocity
+from mathota_jax.solver.table import EMPTY
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.settle import compute_once
+
+STIFF = 16
+"""Multiples of the machine epsilon, relative to two bodies alone, of the least motion that a tree can be said to allow."""
+
+
+class Responses(NamedTuple):
+    """What rows with bounds do to the trees that they act on.
+
+    Attributes:
+      velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
+      matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
+    """
+
+    velocity: Array
+    matrix: Array
+
+
+def responses(links: mechanism.Links, joint_rows: Sequence[Rows], slots: tuple[int, ...]) -> Responses:
+    """The responses to the rows of some slots, which act on nothing but links.
+
+    Args:
+      links: mechanisms at the pose at which the rows act.
+      joint_rows: all joint rows; their laws do not matter.
+      slots: of the rows.
+    """
+    count, block_count = len(slots), links.layout.block_count
+    worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in joint_rows)))
+    tiled, rows = _side_by_side((links, tuple(joint_rows)), count, worlds)
+    units = jnp.repeat(jnp.eye(count, dtype=links.offset.x.dtype), worlds, axis=1)
+    impulse = jnp.zeros((6, block_count, count * worlds), units.dtype)
+    for group, unit in zip(rows, _to_tables(rows, slots, units), strict=True):
+        impulse = add_changes(group, Dense((), group.jacobian), impulse, unit)
+    velocity = compute_once(mechanism.respond(tiled, impulse), impulse)
+    matrix = of_slots(rows, slots, [row_velocity(group, velocity) for group in rows])
+    shape = (count, worlds)
+    matrix = compute_once(matrix.reshape(count, *shape), matrix)
+    return Responses(velocity.reshape(*velocity.shape[:-1], *shape), matrix)
+
+
+def own_mass(matrix: Array, alone: Array, rows: Any) -> Array:
+    """``J M^-1 J^T`` of `rows` with the tree; `alone`: with their two bodies, (row, world), which allow more motion."""
+    own = jnp.stack([matrix[row, row] for row in rows])
+    return jnp.maximum(own, STIFF * jnp.finfo(own.dtype).eps * alone)
+
+
+def solve(
+    responses: Responses,
+    joint_rows: Sequence[Rows],
+    slots: tuple[int, ...],
+    sweeps: int,
+    velocity: Array,
+    impulses: tuple[Array, ...],
+    start: tuple[Array, ...],
+) -> tuple[Array, tuple[Array, ...]]:
+    """Velocity with the rows of some slots solved, and the changes of their impulses.
+
+    Args:
+      responses: to these rows.
+      joint_rows: all joint rows.
+      slots: of the rows to solve.
+      sweeps: over these rows.
+      velocity: (component, block, world) with `impulses`, along which the joints hold.
+      impulses: of the joint groups.
+      start: where the sweeps start from, likewise.
+
+    Returns:
+      Velocity (component, block, world), along which the joints hold, and for each joint group the change of the impulses
+      of these rows. Differentiable in both modes, through the sweeps.
+    """
+    law = jax.tree.map(lambda *parts: of_slots(joint_rows, slots, parts), *(group.law for group in joint_rows))
+    error = of_slots(joint_rows, slots, [group.bias + row_velocity(group, velocity) for group in joint_rows])
+    old, first = (of_slots(joint_rows, slots, values) for values in (impulses, start))
+    ahead = first - old
+    error = error + (responses.matrix * ahead).sum(1)
+    new = _sweep(sweeps, responses.matrix, law, *jnp.broadcast_arrays(first, error))
+    change = new - old
+    moved = velocity + (responses.velocity * change).sum(2)
+    return moved, _to_tables(joint_rows, slots, change)
+
+
+def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:
+    """Whether some of the rows are stops."""
+    return bool((joints.laws[np.asarray(slots)] == STOP).any())
+
+
+def leave_stops(
+    responses: Responses,
+    joint_rows: Sequence[Rows],
+    slots: tuple[int, ...],
+    joints: JointRows,
+    error: Array,
+    sweeps: int,
+) -> Array:
+    """Displacement (component, block, world) that takes trees back from what they are beyond their stops.
+
+    Args:
+      responses: to the rows of `slots`.
+      joint_rows: all joint rows, as the velocity solver had them.
+      slots: of these rows.
+      joints: all joint rows.
+      error: (slot, world) of all rows at the end of the step.
+      sweeps: over the rows.
+    """
+    stops = np.flatnonzero(joints.laws[np.asarray(slots)] == STOP)
+    matrix = responses.matrix[stops][:, stops]
+    error = take(error, np.asarray(slots)[stops])
+    worlds = max(error.shape[-1], matrix.shape[-1])
+    nothing = jnp.zeros((len(stops), worlds), error.dtype)
+    masses = [group.law.effective_mass for group in joint_rows if isinstance(group.law, Bounded)]
+    alone = of_slots(joint_rows, tuple(np.asarray(slots)[stops]), masses)
+    law = Bounded(alone, nothing, nothing, nothing + jnp.inf)
+    pushes = _sweep(sweeps, matrix, law, nothing, jnp.broadcast_to(error, nothing.shape))
+    return (responses.velocity[:, :, stops] * pushes).sum(2)
+
+
+def of_slots(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Sequence[Array]) -> Array:
+    """(row, world) from the (turn, 1, column, world) values of all tables."""
+    tables = [group.table for group in joint_rows]
+    worlds = max(value.shape[-1] for value in values)
+    full = [jnp.broadcast_to(value[:, 0], (*value.shape[:1], *value.shape[2:-1], worlds)) for value in values]
+    return take(collect(tables, full, _slot_count(joint_rows)), np.asarray(slots))
+
+
+def _to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array) -> tuple[Array, ...]:
+    """(turn, 1, column, world) for all tables from (row, world), 0 for other slots."""
+    place = np.full(_slot_count(joint_rows), len(slots))
+    place[np.asarray(slots)] = np.arange(len(slots))
+    of_all = take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), place)
+    return tuple(pack_scalars(group.table, [select(group.table, of_all)], values.shape[-1]) for group in joint_rows)
+
+
+def _slot_count(joint_rows: Sequence[Rows]) -> int:
+    return sum(int((group.table.order != EMPTY).sum()) for group in joint_rows)
+
+
+def _side_by_side(tree: Any, count: int, worlds: int) -> Any:
+    """Copies of all worlds, one for each row; what worlds share stays so."""
+    return jax.tree.map(lambda x: x if x.shape[-1] < worlds or worlds == 1 else jnp.tile(x, count), tree)
+
+
+def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Array) -> Array:
+    """Impulses (row, world) after projected Gauss-Seidel sweeps over a dense matrix (row, row, world)."""
+    works = law.effective_mass > 0
+    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(matrix)))
+    mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
+    law = Bounded(mass, law.softness, law.lower, law.upper)
+    law = jax.tree.map(lambda x: jnp.broadcast_to(x, impulse.shape), law)
+
+    def turn(carry: tuple[Array, Array], row: tuple) -> tuple[tuple[Array, Array], None]:
+        impulse, error = carry
+        place, column, law = row
+        new = law.update(impulse[place], error[place])
+        return (impulse.at[place].set(new), error + column * (new - impulse[place])), None
+
+    def sweep(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        return lax.scan(turn, carry, (jnp.arange(len(matrix)), jnp.swapaxes(matrix, 0, 1), law))
+
+    return lax.scan(sweep, (impulse, error), None, length=sweeps)[0][0]
