@@ -35,7 +35,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.row_matrix import Points
+from mathota_jax.solver.row_matrix import Dense, Points
 from mathota_jax.solver.rows import Places, Rows, matrix_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
@@ -147,7 +147,11 @@ def contact_rows(
     worlds = max(chosen.separation.shape[-1], motion.velocity.shape[-1], motion.free_velocity.shape[-1])
     normal = chosen.normal
     directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
-    matrix = _matrix(scene, table, chosen, directions, motion, pairs, worlds)
+    points = _points(scene, table, chosen, directions, motion, pairs, worlds)
+    # Points are less to read, which pays where sweeps go through lists; where pairs have turns of their own, sweeps have
+    # fewer kernels with all entries. The other solvers need those.
+    listed = pairs is not None and scene.options.solver == "pgs"
+    matrix = points.stored() if listed else points.dense()
     # Stored for reverse mode: else their cotangents are computed again for each entry of the Jacobians.
     start, free = (
         compute_once(along.reshape(-1, along.shape[-1]), chosen.separation)
@@ -164,7 +168,7 @@ def contact_rows(
         target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     # Empty columns of a table have no response.
-    entries = _entries(matrix)
+    entries = _entries(matrix.dense())
     mass = safe_divide(active, _row_bound(table, entries, active, (0,)))
     bias = [-target]
     if scene.friction:
@@ -177,7 +181,7 @@ def contact_rows(
     else:
         law = _push_only(mass[:, None])
     rows = Rows(
-        matrix=matrix if scene.options.solver == "pgs" else matrix.dense(),
+        matrix=matrix,
         bias=pack_scalars(table, bias, worlds),
         law=law,
         table=table,
@@ -195,7 +199,7 @@ def contact_rows(
     )
 
 
-def _matrix(
+def _points(
     scene: Scene,
     table: Table | TracedTable,
     contacts: ContactSet,
@@ -209,7 +213,6 @@ def _matrix(
     signs = _signs(scene, table, pairs)
     along = [direction * signs[0] for direction in directions] if len(signs) == 1 else directions
     packed = pack_directions(table, along, worlds)
-    packed = compute_once(packed, contacts.separation)
     angular, inertias = [], []
     for side, sign in enumerate(signs):
         position, inertia = select_blocks(table, side, (motion.position, motion.inertia), places)
@@ -219,8 +222,7 @@ def _matrix(
         # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
         surface = contacts.position + contacts.normal * (jnp.maximum(contacts.separation, 0.0) * (0.5 * sign))
         arm = compute_once(surface - position, contacts.separation)
-        turned = turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds)
-        angular.append(compute_once(turned, contacts.separation))
+        angular.append(turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds))
     return Points(packed, tuple(angular), tuple(inertias))
 
 
@@ -285,20 +287,15 @@ def _row_bound(
     return compute_once(total / RELAXATION, active)
 
 
-def _entries(matrix: Points) -> tuple[Entries, Entries]:
+def _entries(matrix: Dense) -> tuple[Entries, Entries]:
     """Entries of Jacobian and response for `_row_bound`."""
     # The length of a step does not move the fixed point: its derivative is not worth computing.
     matrix = jax.lax.stop_gradient(matrix)
-
-    linear, angular = matrix.linear_responses(), compute_once(matrix.angular_responses(), matrix.directions)
-    return _components(matrix.linear(), matrix.angular), _components(linear, angular)
-
-
-def _components(linear: Sequence[Array], angular: Sequence[Array]) -> Entries:
-    sides = zip(linear, angular, strict=True) if angular else ((side,) for side in linear)
-    return [
-        [[c for part in side for c in unstack(part[:, row], 1)] for row in range(side[0].shape[1])] for side in sides
-    ]
+    jacobian, response = (
+        [[unstack(row, 1) for row in unstack(side, 1)] for side in sides]
+        for sides in (matrix.jacobian, matrix.response)
+    )
+    return jacobian, response
 
 
 def _largest_eigenvalue(jacobian: Entries, response: Entries, rows: tuple[int, ...]) -> Array:

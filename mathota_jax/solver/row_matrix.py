@@ -116,15 +116,10 @@ class Points:
             for sign, side in zip(self._signs, self.inertia, strict=True)
         )
 
-    def angular_responses(self) -> tuple[Array, ...]:
-        """The last three components of the response of each side."""
-        found = []
-        for side, inertia in zip(self.angular, self.inertia, strict=bool(self.angular)):
-            components = unstack(side, -3)
-            like = components[0].shape
-            of_columns = jax.tree.map(lambda x, like=like: spread(self._of_columns(x)[..., 0, :, :], like), inertia)
-            found.append(jnp.stack(of_columns.solve(Vec3(*components)), axis=-3))
-        return tuple(found)
+    def stored(self) -> Points:
+        """The same, computed once."""
+        directions, angular = compute_once((self.directions, self.angular), self.like)
+        return Points(directions, angular, self.inertia)
 
     def first_row(self) -> Points:
         """As `Dense.first_row`."""
@@ -132,16 +127,20 @@ class Points:
 
     def dense(self) -> Dense:
         """The same rows with all entries. Stored: each product, and each cotangent, would compute them again."""
-        return compute_once(self._dense(), self.like)
+        sides = self.linear()
+        if self.angular:
+            sides = tuple(jnp.concatenate(parts, axis=-3) for parts in zip(sides, self.angular, strict=True))
+        jacobian = compute_once(sides, self.like)
+        response = tuple(self._respond(side, inertia) for side, inertia in zip(jacobian, self.inertia, strict=True))
+        return Dense(jacobian, compute_once(response, self.like))
 
-    def _dense(self) -> Dense:
-        if not self.angular:
-            return Dense(self.linear(), self.linear_responses())
-
-        def join(linear: Sequence[Array], angular: Sequence[Array]) -> tuple[Array, ...]:
-            return tuple(jnp.concatenate(parts, axis=-3) for parts in zip(linear, angular, strict=True))
-
-        return Dense(join(self.linear(), self.angular), join(self.linear_responses(), self.angular_responses()))
+    def _respond(self, jacobian: Array, inertia: InverseInertia) -> Array:
+        components = unstack(jacobian, -3)
+        like = components[0].shape
+        of_columns = jax.tree.map(lambda x: spread(self._of_columns(x)[..., 0, :, :], like), inertia)
+        linear = [component * of_columns.inverse_mass for component in components[:3]]
+        angular = of_columns.solve(Vec3(*components[3:])) if components[3:] else ()
+        return jnp.stack([*linear, *angular], axis=-3)
 
     def _of_columns(self, values: Array) -> Array:
         """(..., 1, 1, column, world) from (..., constraint, world)."""
