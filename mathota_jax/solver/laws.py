@@ -57,14 +57,10 @@ class Cone:
 
     def update(self, impulse: Array, error: Array) -> Array:
         """Normal row first, then the tangents with the normal's new impulse."""
-        axis = impulse.ndim - 3  # of the rows: 0 for one turn, 1 for a whole table
-        normal = jnp.arange(3)[:, None, None] == 0
-        mass = jnp.where(normal, jnp.expand_dims(self.normal_mass, axis), jnp.expand_dims(self.tangent_mass, axis))
-        free = impulse - error * mass
-        pushing, first, second = unstack(free, axis)
-        scale = self._share(jnp.maximum(pushing, 0.0), first, second)
-        # A selection, since XLA does not compute a stack of different expressions side by side.
-        return jnp.where(normal, jnp.maximum(free, 0.0), free * jnp.expand_dims(scale, axis))
+        row = impulse.ndim - 3
+        old_n, *old = unstack(impulse, row)
+        error_n, *errors = unstack(error, row)
+        return self.with_friction(jnp.maximum(old_n - error_n * self.normal_mass, 0.0), old, errors)
 
     def with_friction(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> Array:
         """All three rows for a new impulse of the normal row; `old` and `errors` are those of the tangents."""
