@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import velocity_system
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
 
 STEPS = 20
 """Proximal steps. Each leaves the share delta / (delta + s) of the error along a mode of stiffness s."""
@@ -36,6 +36,7 @@ def solve(
       right_sides: r for each group, (turn, row, column, world).
       velocity: d, (component, block, world).
     """
+    rows = visiting_all_turns(rows)
     delta = DELTA[str(velocity.dtype)]
     inverses = tuple(_inverse(by_impulse, delta) for by_impulse, _ in jacobians)
     slopes = tuple(_product(inverse, by_error) for inverse, (_, by_error) in zip(inverses, jacobians, strict=True))

@@ -31,6 +31,7 @@ from mathota_jax.solver.rows import (
     matrix_velocity,
     receive,
     row_velocity,
+    visiting_all_turns,
 )
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
@@ -159,7 +160,7 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     rows, d_rows = _dense(rows, d_rows)
     d_velocity, jacobians, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     d_impulses = _solve_linear(gradient_iterations, rows, jacobians, right_sides)
-    return (velocity, impulses), (add_impulses(rows, d_velocity, d_impulses), d_impulses)
+    return (velocity, impulses), (add_impulses(visiting_all_turns(rows), d_velocity, d_impulses), d_impulses)
 
 
 def _dense(rows: tuple[Rows, ...], d_rows: tuple[Rows, ...]) -> tuple[tuple[Rows, ...], tuple[Rows, ...]]:
@@ -181,7 +182,7 @@ def linearise(
       The change of the velocity at fixed impulses; for each group the Jacobians of its law with respect to impulse and
       error, and the change of its impulses at fixed impulses.
     """
-    for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
+    for group, d_group, impulse in zip(visiting_all_turns(rows), d_rows, impulses, strict=True):
         d_velocity = add_changes(group, d_group.matrix, d_velocity, impulse)
     jacobians, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
@@ -204,9 +205,10 @@ def _solve_linear(
     `jacobians` holds for each group the Jacobians K and H of its law with respect to impulse and error. The transposed
     system, ``z = K^T z + (M^-1 J^T)^T (J^T H^T z) + ...``, has the same form: Jacobian and response change places.
     """
+    everywhere = visiting_all_turns(rows)  # the product is transposed too
 
     def product(x: tuple[Array, ...]) -> tuple[Array, ...]:
-        velocity = add_impulses(rows, _no_velocity(rows), x)
+        velocity = add_impulses(everywhere, _no_velocity(rows), x)
         return tuple(
             part - _apply(by_impulse, part) - _apply(by_error, row_velocity(group, velocity))
             for part, group, (by_impulse, by_error) in zip(x, rows, jacobians, strict=True)

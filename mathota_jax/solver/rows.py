@@ -8,6 +8,7 @@ Layout: turn first, so that a turn is a contiguous slice; then row, component, c
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, Protocol
 
@@ -155,6 +156,16 @@ def matrix_velocity(table: Table | TracedTable, matrix: RowMatrix, places: Place
     return matrix.rates(gathered)
 
 
+def visiting_all_turns(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
+    """The same rows, whose loops also visit the turns without constraints: those have a reverse mode."""
+    return tuple(
+        group
+        if group.places is None
+        else dataclasses.replace(group, places=dataclasses.replace(group.places, turns=None))
+        for group in rows
+    )
+
+
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
     for group, impulse in zip(rows, impulses, strict=True):
@@ -190,21 +201,31 @@ def _by_turn(tree: Any, turn_count: int) -> list[Any]:
     return [jax.tree.unflatten(structure, turn) for turn in zip(*(unstack(x, 0) for x in leaves), strict=True)]
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _add_at_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
-    """`add_changes` over those turns that hold a constraint; that loop has no reverse mode."""
+    if places.turns is not None:
+        return _add_at_filled_places(together, places, matrix, velocity, impulse)
+
+    def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
+        blocks, part, values = at_turn
+        return receive(velocity, blocks, part.changes(values, together)), None
+
+    return lax.scan(body, velocity, (places.blocks, matrix, impulse))[0]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _add_at_filled_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
+    """Over those turns that hold a constraint; that loop has no reverse mode."""
 
     def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         turn, velocity = carry
         blocks, part, values = counter.row((places.blocks, matrix, impulse), turn)
         return counter.following(turn), receive(velocity, blocks, part.changes(values, together))
 
-    turns = impulse.shape[0] if places.turns is None else places.turns
-    return lax.fori_loop(0, turns, body, (counter.start(), velocity))[1]
+    return lax.fori_loop(0, places.turns, body, (counter.start(), velocity))[1]
 
 
-@_add_at_places.defjvp
-def _add_at_places_jvp(together: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+@_add_at_filled_places.defjvp
+def _add_at_filled_places_jvp(together: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     places, matrix, _, impulse = primals
     _, d_matrix, d_velocity, d_impulse = tangents
 
@@ -214,7 +235,7 @@ def _add_at_places_jvp(together: int, primals: tuple, tangents: tuple) -> tuple[
         return receive(d_velocity, blocks, d_changes), None
 
     scanned = (places.blocks, (matrix, impulse), (d_matrix, d_impulse))
-    return _add_at_places(together, *primals), lax.scan(body, d_velocity, scanned)[0]
+    return _add_at_filled_places(together, *primals), lax.scan(body, d_velocity, scanned)[0]
 
 
 def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...]) -> Array:

@@ -30,7 +30,7 @@ from jax import Array, lax
 from mathota_jax.solver import pgs
 from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, row_velocity
+from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, row_velocity, visiting_all_turns
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle
@@ -291,13 +291,7 @@ def _sweep_jvp(count: int, primals: tuple, tangents: tuple) -> tuple:
     """A loop over the turns in use has no reverse mode; a loop over all turns, which does the same, has."""
 
     def sweep_all_turns(rows: tuple[Rows, ...], *others: Any) -> tuple[Array, tuple[Array, ...]]:
-        everywhere = tuple(
-            group
-            if group.places is None
-            else dataclasses.replace(group, places=dataclasses.replace(group.places, turns=None))
-            for group in rows
-        )
-        return _sweep.fun(count, everywhere, *others)
+        return _sweep.fun(count, visiting_all_turns(rows), *others)
 
     return jax.jvp(sweep_all_turns, primals, tangents)
 

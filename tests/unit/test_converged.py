@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 from mathota_jax import Flag, Options, step
 from mathota_jax.solver import converged, pgs
 from mathota_jax.solver.laws import Bounded, Cone
+from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Constraint, make_tables
 from tests.scenes import box_stack, slab_on_plane, undamped
@@ -72,7 +73,7 @@ def rows_of(jacobian, inverse_mass, friction):
             tangent = jnp.minimum(mass[:, 1], mass[:, 2]) / 2
             law = Cone(mass[:, 0], tangent, jnp.full_like(tangent, friction))
         bias = jnp.zeros((table.turn_count, jacobian.shape[1], table.column_count, 1))
-        rows.append(Rows(tuple(sides), tuple(responses), bias, law, table))
+        rows.append(Rows(Dense(tuple(sides), tuple(responses)), bias, law, table))
     return tuple(rows)
 
 
