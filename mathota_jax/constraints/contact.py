@@ -30,25 +30,19 @@ from mathota_jax.constraints.assembly import (
     smaller_side,
     turn_of_points,
 )
+from mathota_jax.constraints.effective_mass import entries_of, row_bound
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.row_matrix import Dense, Points
+from mathota_jax.solver.row_matrix import Points
 from mathota_jax.solver.rows import Places, Rows, matrix_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
-from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.settle import compute_once, materialize, settle
+from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
-
-Entries = list[list[list[Array]]]
-"""Components (turn, column, world) by side and row."""
-
-RELAXATION = 4 / 3
-"""Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
 
 
 class Motion(NamedTuple):
@@ -168,13 +162,13 @@ def contact_rows(
         target, lever = impact(approach, model.dt)
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     # Empty columns of a table have no response.
-    entries = _entries(matrix.dense())
-    mass = safe_divide(active, _row_bound(table, entries, active, (0,)))
+    entries = entries_of(matrix.dense())
+    mass = safe_divide(active, row_bound(entries, table.together, active, (0,)))
     bias = [-target]
     if scene.friction:
         law = Cone(
             normal_mass=mass,
-            tangent_mass=safe_divide(active, _row_bound(table, entries, active, (1, 2))),
+            tangent_mass=safe_divide(active, row_bound(entries, table.together, active, (1, 2))),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
@@ -252,64 +246,6 @@ def rows_one_by_one(
     chosen = jax.tree.map(by_turn, select(table, contacts))
     found = map_filled(rows, (chosen, blocks, pairs._replace(places=None)), turns)
     return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
-
-
-def _row_bound(
-    table: Table | TracedTable,
-    entries: tuple[Entries, Entries],
-    active: Array,
-    rows: tuple[int, ...],
-) -> Array:
-    """Bound (turn, column, world) of the response of each point to impulses on all points of its manifold, along `rows`.
-
-    The points of a manifold are solved together, which keeps the symmetry of a stack: solved one after the other they
-    tilt it. A step divided by the sum of the norms of the blocks ``J_i M^-1 J_j^T`` over j can not overshoot
-    (Gershgorin); the steps are lengthened by a constant, which is safe below 2. A point alone gets its exact effective
-    mass.
-    """
-    count = table.together
-    jacobian, response = entries
-    total = _largest_eigenvalue(jacobian, response, rows)
-    if count == 1:
-        return compute_once(total, active)
-
-    def block(row: int, column: int) -> Array:
-        return point_responses([side[row] for side in jacobian], [side[column] for side in response], count)
-
-    blocks = [block(row, column) for row in rows for column in rows]
-    if len(blocks) > 1:
-        # All in one kernel is not vectorised, and takes ten times as long.
-        blocks = materialize(blocks)
-    squared = sum((entries**2 for entries in blocks), jnp.zeros(()))
-    others = 1.0 - np.eye(count)[:, :, None]
-    norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], -1, 1, count, active.shape[-1]))
-    total = functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(count)], total)
-    return compute_once(total / RELAXATION, active)
-
-
-def _entries(matrix: Dense) -> tuple[Entries, Entries]:
-    """Entries of Jacobian and response for `_row_bound`."""
-    # The length of a step does not move the fixed point: its derivative is not worth computing.
-    matrix = jax.lax.stop_gradient(matrix)
-    jacobian, response = (
-        [[unstack(row, 1) for row in unstack(side, 1)] for side in sides]
-        for sides in (matrix.jacobian, matrix.response)
-    )
-    return jacobian, response
-
-
-def _largest_eigenvalue(jacobian: Entries, response: Entries, rows: tuple[int, ...]) -> Array:
-    """Of the response of one point along one or two rows; the arguments hold components by side and row."""
-
-    def entry(row: int, column: int) -> Array:
-        terms = [a * b for j, r in zip(jacobian, response, strict=True) for a, b in zip(j[row], r[column], strict=True)]
-        return functools.reduce(jnp.add, terms)
-
-    if len(rows) == 1:
-        return entry(rows[0], rows[0])
-    first, second, coupling = entry(rows[0], rows[0]), entry(rows[1], rows[1]), entry(rows[0], rows[1])
-    half_difference = (first - second) / 2
-    return (first + second) / 2 + safe_sqrt(half_difference * half_difference + coupling * coupling)
 
 
 def _push_only(effective_mass: Array) -> Bounded:
