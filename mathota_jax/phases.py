@@ -169,9 +169,9 @@ def correct_positions(
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
     if options.solver == "converged":
         correction = converged.solve(tuple(rows), zero, start)[0]
-        return displace(moved, inertia, correction if back is None else correction + back)
-    iterations = options.position_iterations
-    correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
+    else:
+        iterations = options.position_iterations
+        correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
     return displace(moved, inertia, correction if back is None else correction + back)
 
 

@@ -95,7 +95,7 @@ def _restitution(model: Model, rows: Rows, worlds: int) -> Array:
 
 def _speeds(rows: Rows, velocity: Array) -> Array:
     """(turn, 1, column, world) sum of the speeds of both bodies along the normal of each contact, or more."""
-    sides = Dense(tuple(jnp.abs(side) for side in rows.jacobian), rows.response)
+    sides = Dense(tuple(jnp.abs(side) for side in rows.jacobian), ())
     return matrix_velocity(rows.table, sides.first_row(), rows.places, jnp.abs(velocity))
 
 

@@ -79,8 +79,8 @@ def levers(
         else:
             lever = group.lever[:, :, None]
             share = _weighted(jnp.ones_like(lever), lever)
-            sides = len(group.rows.matrix.linear_responses())
-            total = add_changes(group.rows, Dense((), (share,) * sides), total, impulse[:, :1])
+            parts = (share,) * len(group.rows.jacobian)
+            total = add_changes(group.rows, Dense((), parts), total, impulse[:, :1])
     mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
     return mean, _beyond(total[2:], mean - half, solved - free) if several else None
 

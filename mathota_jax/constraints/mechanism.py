@@ -251,25 +251,21 @@ def _impulses(links: Links, wanted: Impulses) -> Impulses:
     return _held(links, [*linear, *(dot(dual, about) for dual in duals[1])])
 
 
+@jax.custom_jvp
 def respond(links: Links, impulse: Array) -> Array:
     """Velocities (component, block, world) under impulses on the bodies, likewise, with the joints held.
 
     Differentiable in both modes.
     """
-    return _respond(links, impulse)
-
-
-@jax.custom_jvp
-def _respond(links: Links, impulse: Array) -> Array:
     of_links = take(unpack_blocks(impulse), links.layout.blocks)
     worlds = max(impulse.shape[-1], links.factors.offset.shape[-1])
     motion = tree.respond(links.layout.tree, links.factors, in_every_world(_pack(*of_links), worlds))
     return _to_blocks(links.layout, pack_blocks(*_unpack(motion)))
 
 
-@_respond.defjvp
+@respond.defjvp
 def _respond_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    found = _respond(*primals)
+    found = respond(*primals)
 
     def again(links: Links, impulse: Array) -> Array:
         """The same from the bodies alone, whose motion along the rows is taken back."""

@@ -57,7 +57,7 @@ class Cone:
 
     def update(self, impulse: Array, error: Array) -> Array:
         """Normal row first, then the tangents with the normal's new impulse."""
-        row = impulse.ndim - 3
+        row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
         old_n, *old = unstack(impulse, row)
         error_n, *errors = unstack(error, row)
         return self.with_friction(jnp.maximum(old_n - error_n * self.normal_mass, 0.0), old, errors)
@@ -67,16 +67,12 @@ class Cone:
         (old_1, old_2), (error_1, error_2) = old, errors
         free_1 = old_1 - error_1 * self.tangent_mass
         free_2 = old_2 - error_2 * self.tangent_mass
-        scale = self._share(normal, free_1, free_2)
-        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
-
-    def _share(self, normal: Array, first: Array, second: Array) -> Array:
-        """Of the impulses that would stop both tangents, how much the normal impulse allows."""
-        squared = first * first + second * second
+        squared = free_1 * free_1 + free_2 * free_2
         limit = self.friction * normal
         # At the apex of the cone nothing sticks: a derivative must not see friction where nothing presses.
         sliding = squared >= limit * limit
-        return jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
+        scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
+        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
 
 
 Law = Bounded | Cone

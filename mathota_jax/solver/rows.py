@@ -178,43 +178,33 @@ def add_changes(group: Rows, matrix: Changes, velocity: Array, impulse: Array) -
 
     Its components may be others than those of a velocity.
     """
-    table = group.table
-    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((velocity, impulse, matrix)))
-    if group.places is not None:
-        return _add_at_places(table.together, group.places, matrix, in_every_world(velocity, worlds), impulse)
-    if table.turn_count <= UNROLLED_SUMS:
-        for turn, (part, values) in enumerate(_by_turn((matrix, impulse), table.turn_count)):
+    table, places = group.table, group.places
+    if places is None and table.turn_count <= UNROLLED_SUMS:
+        for turn, (part, values) in enumerate(_by_turn((matrix, impulse))):
             velocity = receive(velocity, table.receivers[turn], part.changes(values, table.together))
         return velocity
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((velocity, impulse, matrix)))
+    velocity = in_every_world(velocity, worlds)
+    if places is not None and places.turns is not None:
+        return _add_at_filled_places(table.together, places, matrix, velocity, impulse)
 
     def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
         receivers, part, values = at_turn
         return receive(velocity, receivers, part.changes(values, table.together)), None
 
-    start = in_every_world(velocity, worlds)
-    return lax.scan(body, start, (jnp.asarray(table.receivers), matrix, impulse))[0]
+    receivers = jnp.asarray(table.receivers) if places is None else places.blocks
+    return lax.scan(body, velocity, (receivers, matrix, impulse))[0]
 
 
-def _by_turn(tree: Any, turn_count: int) -> list[Any]:
+def _by_turn(tree: Any) -> list[Any]:
     """The turns of a pytree of arrays (turn, ...)."""
     leaves, structure = jax.tree.flatten(tree)
     return [jax.tree.unflatten(structure, turn) for turn in zip(*(unstack(x, 0) for x in leaves), strict=True)]
 
 
-def _add_at_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
-    if places.turns is not None:
-        return _add_at_filled_places(together, places, matrix, velocity, impulse)
-
-    def body(velocity: Array, at_turn: tuple) -> tuple[Array, None]:
-        blocks, part, values = at_turn
-        return receive(velocity, blocks, part.changes(values, together)), None
-
-    return lax.scan(body, velocity, (places.blocks, matrix, impulse))[0]
-
-
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _add_at_filled_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
-    """Over those turns that hold a constraint; that loop has no reverse mode."""
+    """`add_changes` over those turns that hold a constraint; that loop has no reverse mode."""
 
     def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         turn, velocity = carry

@@ -58,9 +58,8 @@ def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used:
             lambda all_, x: lax.dynamic_update_index_in_dim(all_, x, k, 0), results, function(chunk, *constants)
         )
 
-    count = jax.tree.leaves(chunks)[0].shape[0]
-    shapes = jax.eval_shape(lambda chunks: function(jax.tree.map(lambda x: x[0], chunks), *constants), chunks)
-    zeros = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), shapes)
+    chunk = jax.tree.map(lambda x: x[0], chunks)
+    zeros = _zeros(function, constants, chunk, jax.tree.leaves(chunks)[0].shape[:1])
     return lax.fori_loop(0, used, body, zeros)
 
 
@@ -73,13 +72,17 @@ def _map_chunks_jvp(function: Callable[..., Any], primals: tuple, tangents: tupl
             return function(chunk, *constants)
 
         def body(k: Array, chunk: Any) -> tuple[Array, Any]:
-            shapes = jax.eval_shape(evaluate, chunk)
-            empty = lambda _: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)  # noqa: E731
-            return k + 1, lax.cond(k < used, evaluate, empty, chunk)
+            return k + 1, lax.cond(k < used, evaluate, lambda chunk: _zeros(function, constants, chunk), chunk)
 
         return lax.scan(body, jnp.zeros((), used.dtype), chunks)[1]
 
     return jax.jvp(every_chunk, primals, tangents)
+
+
+def _zeros(function: Callable[..., Any], constants: Any, chunk: Any, leading: tuple[int, ...] = ()) -> Any:
+    """Zeros of the shapes that the function gives for a chunk, with further axes in front."""
+    shapes = jax.eval_shape(function, chunk, *constants)
+    return jax.tree.map(lambda x: jnp.zeros((*leading, *x.shape), x.dtype), shapes)
 
 
 def _chunk_count(count: int) -> int:
