@@ -18,6 +18,7 @@ from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
 from tests.hulls import BOX_CORNERS, hull
+from tests.round_oracle import round_distance
 
 KINDS = ("sphere", "capsule", "box", "cylinder", "cone", "polyhedron")
 ROUND, FLAT = ("sphere", "capsule"), ("box", "polyhedron")
@@ -163,6 +164,8 @@ class Placed:
     """One pose of a pair: the difference B - A through its support function, in NumPy only."""
 
     def __init__(self, pair, scene, index):
+        self.pair = pair
+        self.scene = jax.tree.map(lambda rows: rows[index : index + 1], scene)
         self.sides = []
         for side, kind in zip("ab", pair, strict=True):
             shape = {name: value[index] for name, value in scene[side].items()}
@@ -212,7 +215,11 @@ def oracle(placed, tolerance=1e-10):
 
     Apart: the nearest point of the hull by non-negative least squares. Overlapping: the nearest facet by Qhull, which is
     the global minimum of the depth since every facet of the true difference lies outside the hull found so far.
+    Spheres and capsules: in closed form, for the cutting planes lose digits where the cores all but meet.
     """
+    if {kind for kind, *_ in placed.sides} <= set(ROUND):
+        separations, normals = round_distance(placed.pair, placed.scene)
+        return separations[0], normals[0]
     points = placed.seeds()
     for _ in range(500):
         rows = np.array(points)
@@ -226,14 +233,6 @@ def oracle(placed, tolerance=1e-10):
         if normal @ point >= gap - tolerance:
             return placed.reach(normal), normal
         points.append(point)
-    if {kind for kind, *_ in placed.sides} <= set(ROUND):  # the cores, points or segments, meet or all but meet
-        middle = np.mean(points, axis=0)
-        axes = np.linalg.svd(np.array(points) - middle)[2]
-        aside = middle - axes[0] * (axes[0] @ middle)  # from a segment; across a parallelogram it is the last axis
-        aside = aside / max(np.linalg.norm(aside), 1e-300)
-        candidates = [axes[-1], -axes[-1], *([aside] if aside.any() else [])]
-        normal = max(candidates, key=placed.reach)
-        return placed.reach(normal), normal
     # Q12: Qhull gives up on a facet a hundred of its round-offs (1e-17 m) wide, which is nothing beside the tolerance.
     hull = ConvexHull(np.array(points), incremental=True, qhull_options="Qt Q12")
     for _ in range(400):

@@ -87,6 +87,35 @@ def test_what_is_not_flagged_is_right(pair, kind, precision):
     assert result["converged"].mean() >= (0.7 if kind.startswith("needles") else 0.9)
 
 
+@pytest.mark.parametrize("other", ["capsule", "box"])
+def test_a_sphere_whose_centre_all_but_touches_the_core(other, precision):
+    """From 1e-9 to 1e-3 off an axis, a corner, an edge or a face, in any direction: in closed form, and proved."""
+    rng, count = np.random.default_rng(11), 400
+    core = np.array([0.0, 0.7, 0.0]) if other == "capsule" else np.array([0.3, 0.7, 0.5])
+    on_core = core * rng.choice([-1.0, 0.25, 1.0], size=(count, 3))
+    if other == "box":
+        on_core[:, 0] = core[0] * rng.choice([-1.0, 1.0], size=count)
+    outward = rng.normal(size=(count, 3))
+    outward = np.where(np.abs(on_core) == core, np.copysign(outward, on_core), 0.0)
+    if other == "capsule":
+        outward[:, [0, 2]] = rng.normal(size=(count, 2))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    offset = outward * 10 ** rng.uniform(-9, -3, (count, 1))
+    turns = Rotation.random(count, random_state=rng)
+    shape = {"half_extents": np.tile(core, (count, 1))}
+    if other == "capsule":
+        shape = {"radius": np.full(count, 0.4), "half_height": np.full(count, 0.7)}
+    scene = {
+        "a": {"radius": np.full(count, 0.5)}, "b": shape, "pa": turns.apply(on_core + offset), "pb": np.zeros((count, 3)),
+        "qa": np.tile([1.0, 0, 0, 0], (count, 1)), "qb": turns.as_quat()[:, [3, 0, 1, 2]],
+    }  # fmt: skip
+    result = Result(("sphere", other), rounded(scene, precision), precision)
+    expected = np.linalg.norm(offset, axis=1) - (0.9 if other == "capsule" else 0.5)
+    single = precision == np.float32
+    np.testing.assert_allclose(result.separation, expected, atol=2e-5 if single else 1e-12)
+    assert single or result.converged.all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", PAIRS, ids=["_".join(pair) for pair in PAIRS])
 def test_many_random_poses(pair, precision):

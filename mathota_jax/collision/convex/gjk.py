@@ -174,7 +174,9 @@ def _apply(
     second_point, third_point = pick(second, state.points), pick(third, state.points)
     edge, other = second_point - point, third_point - point
     squared = dot(edge, edge)
-    foot = point + edge * (-dot(point, edge) / jnp.where(on_edge, squared, 1.0))
+    inverse = 1.0 / jnp.where(on_edge, squared, 1.0)
+    foot = point - edge * (dot(point, edge) * inverse)
+    foot = foot - edge * (dot(foot, edge) * inverse)  # across the edge also where little is left after cancellation
     normal = cross(edge, other)
     height = normal * (dot(normal, point) / jnp.where(on_triangle, dot(normal, normal), 1.0))
     closest = where(on_triangle, height, where(on_edge, foot, point))

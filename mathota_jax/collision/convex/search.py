@@ -60,8 +60,11 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
         found = gjk(shapes, state.start, state.shift, ~state.done, POLYTOPE_ITERATIONS)
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), found, state.simplex)
         first = state.turn == 0
-        wanted = first & (found.overlap | _stalled(shapes, found, tolerance))
+        reach = _reach(shapes, found)
+        wanted = first & (found.overlap | _stalled(found, reach, tolerance))
         axis = separating_axis(shapes, a, b, wanted)
+        # The test knows no axis from a corner: of shapes that are apart it may find less than the search did.
+        wanted &= found.overlap | (axis.separation > reach)
         upper = jnp.where(first, jnp.where(found.overlap, axis.separation, found.distance), state.upper)
         shift = axis.direction * (LIFT - axis.separation)
         return _Lifted(state.turn + 1, simplex, axis.direction, shift, upper, ~wanted)
@@ -74,9 +77,13 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
     return state.simplex, state.upper
 
 
-def _stalled(shapes: Difference, found: Simplex, tolerance: float) -> Array:
+def _reach(shapes: Difference, found: Simplex) -> Array:
+    """True separation along the direction of a simplex: a lower bound."""
+    return dot(found.direction, shapes.least(found.direction)[0])
+
+
+def _stalled(found: Simplex, reach: Array, tolerance: float) -> Array:
     """Whether the search stalled on a needle of a simplex, close to touch: its direction proves nothing."""
-    reach = dot(found.direction, shapes.least(found.direction)[0])
     return (found.distance < CLOSE) & (reach < found.distance - tolerance)
 
 
@@ -113,7 +120,7 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Array]
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), found, state.simplex)
         first = index == 0
         overlap = jnp.where(first, found.overlap, state.overlap)
-        wanted = jnp.where(first, found.overlap | _stalled(shapes, found, tolerance), ~state.done)
+        wanted = jnp.where(first, found.overlap | _stalled(found, _reach(shapes, found), tolerance), ~state.done)
         limit = jnp.where(first, GLANCE, jnp.where(index <= PROOFS, PROOF, 0))
         least = epa(shapes, simplex.direction, wanted, limit, PROOF, tolerance)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
