@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import Difference, barycentric, combine, unit
+from mathota_jax.collision.convex.polytope import are_polytopes
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, where
 
@@ -33,16 +34,16 @@ class Simplex(NamedTuple):
     Attributes:
         direction: Unit vector from A towards B, shape ``(pair, world)`` a component.
         pieces: Three int32 piece pairs; unused slots repeat the first.
-        point_a: The closest point of A, in the frame of A.
-        point_b: The closest point of B (before the shift), in the frame of A.
+        point_a: The closest point of A, in the frame of A; None for polytopes, whose pieces say where it is.
+        point_b: The closest point of B (before the shift), in the frame of A; None for polytopes.
         distance: Length of the vector between the closest points (after the shift).
         overlap: bool, the shapes touch or overlap.
     """
 
     direction: Vec3
     pieces: tuple[Array, ...]
-    point_a: Vec3
-    point_b: Vec3
+    point_a: Vec3 | None
+    point_b: Vec3 | None
     distance: Array
     overlap: Array
 
@@ -52,7 +53,7 @@ class _State(NamedTuple):
     closest: Vec3
     squared: Array
     points: tuple[Vec3, ...]
-    points_a: tuple[Vec3, ...]
+    points_a: tuple[Vec3, ...] | None
     pieces: tuple[Array, ...]
     count: Array
     overlap: Array
@@ -69,18 +70,23 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
         wanted: bool, False where the result is not needed: those lanes stop at once.
         iterations: Most iterations. All lanes stop as soon as they have converged.
     """
+    tracked = not are_polytopes((shapes.kind_a, shapes.kind_b))
     eps = float(jnp.finfo(start.x.dtype).eps)
     noise = (OVERLAP_ROUNDING * eps) ** 2
 
     def advance(state: _State) -> _State:
         pieces = shapes.pieces(state.closest)
-        point_a, point_b = compute_once(shapes.points(pieces, state.closest), start.x)
-        point = point_b - point_a + shift
+        point_a, point_b = shapes.points(pieces, state.closest)
+        if tracked:
+            point_a, point_b = compute_once((point_a, point_b), start.x)
+        point = compute_once(point_b - point_a + shift, start.x)
         # Lanes whose new point does not come closer along the direction have converged.
         gain = state.squared - dot(state.closest, point)
         reached = (state.count > 0) & (gain <= 8.0 * eps * state.squared + 4.0 * eps * jnp.sqrt(state.squared))
         choice = _choose(state, point, reached | state.done)
-        closest, points, points_a, new_pieces, count = _apply(state, point, point_a, pieces, choice)
+        closest, points, points_a, new_pieces, count = _apply(
+            state, point, point_a if tracked else None, pieces, choice
+        )
         overlap = (choice == INSIDE) | ((choice < INSIDE) & (dot(closest, closest) <= noise))
         keep = choice == KEEP
         return _State(
@@ -104,7 +110,7 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
         first,
         zero + jnp.inf,
         (first,) * 3,
-        (first,) * 3,
+        (first,) * 3 if tracked else None,
         (none,) * 3,
         none,
         none < 0,
@@ -117,9 +123,11 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
         jnp.where(state.count > 2, state.pieces[2], state.pieces[0]),
     )
     two, three = state.count > 1, state.count > 2
-    weights = barycentric(state.points, two, three)
-    point_a = combine(weights, state.points_a)
-    point_b = point_a + combine(weights, state.points) - shift
+    point_a = point_b = None
+    if state.points_a is not None:
+        weights = barycentric(state.points, two, three)
+        point_a = combine(weights, state.points_a)
+        point_b = point_a + combine(weights, state.points) - shift
     return Simplex(unit(state.closest, first), pieces, point_a, point_b, norm(state.closest), state.overlap)
 
 
@@ -157,8 +165,8 @@ def _choose(state: _State, point: Vec3, stop: Array) -> Array:
 
 
 def _apply(
-    state: _State, point: Vec3, point_a: Vec3, pieces: Array, choice: Array
-) -> tuple[Vec3, tuple[Vec3, ...], tuple[Vec3, ...], tuple[Array, ...], Array]:
+    state: _State, point: Vec3, point_a: Vec3 | None, pieces: Array, choice: Array
+) -> tuple[Vec3, tuple[Vec3, ...], tuple[Vec3, ...] | None, tuple[Array, ...], Array]:
     """Closest point and simplex of a choice: the newest point in slot 0, its companions after it."""
     keep = choice >= INSIDE
     on_edge, on_triangle = (choice >= EDGE) & (choice < TRIANGLE), (choice >= TRIANGLE) & (choice < INSIDE)
@@ -180,15 +188,14 @@ def _apply(
     normal = cross(edge, other)
     height = normal * (dot(normal, point) / jnp.where(on_triangle, dot(normal, normal), 1.0))
     closest = where(on_triangle, height, where(on_edge, foot, point))
-    old, old_a = state.points, state.points_a
+
+    def following(new: Vec3, old: tuple[Vec3, ...]) -> tuple[Vec3, ...]:
+        return tuple(where(keep, o, n) for o, n in zip(old, (new, pick(second, old), pick(third, old)), strict=True))
+
     return (
         where(keep, state.closest, closest),
-        (where(keep, old[0], point), where(keep, old[1], second_point), where(keep, old[2], third_point)),
-        (
-            where(keep, old_a[0], point_a),
-            where(keep, old_a[1], pick(second, old_a)),
-            where(keep, old_a[2], pick(third, old_a)),
-        ),
+        following(point, state.points),
+        None if point_a is None or state.points_a is None else following(point_a, state.points_a),
         (
             jnp.where(keep, state.pieces[0], pieces),
             jnp.where(keep, state.pieces[1], pick_code(second, state.pieces)),

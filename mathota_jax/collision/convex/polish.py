@@ -75,9 +75,7 @@ def polish(shapes: Difference, simplex: Simplex) -> Closest:
     rounding = ROUNDING * float(jnp.finfo(shapes.position.x.dtype).eps)
     found = _find(frozen, simplex, rounding)
     ties, start = found.best_ties, found.best_normal
-    # The step contributes its derivative only; its value is round-off, which a soft contact would amplify.
-    stepped = _step(shapes, ties, start, _differences(_tied_points(shapes, ties, start)))
-    normal = start + where(found.exact, stepped - lax.stop_gradient(stepped), start - start)
+    normal = _implicit_normal(shapes, start, ties, found.exact)
     points = _tied_points(shapes, ties, normal)
     weights = barycentric(_differences(points), ties.two, ties.three)
     lowest = lax.stop_gradient(jnp.minimum(weights[0], jnp.minimum(weights[1], weights[2])))
@@ -94,6 +92,27 @@ def polish(shapes: Difference, simplex: Simplex) -> Closest:
         if SUPPORT[kind].rim_radius is not None:
             result, best = _flat_end(shapes, simplex, result, best, bool(of_b), rounding)
     return result
+
+
+@jax.custom_jvp
+def _implicit_normal(shapes: Difference, start: Vec3, ties: Ties, exact: Array) -> Vec3:
+    """The solution `start` with the derivative of a Newton step from it where it is exact, and none elsewhere.
+
+    The value of the step is round-off, which a soft contact would amplify; it is not computed where no derivative is.
+    """
+    return start
+
+
+@_implicit_normal.defjvp
+def _implicit_normal_jvp(primals: tuple, tangents: tuple) -> tuple[Vec3, Vec3]:
+    shapes, start, ties, exact = primals
+
+    def step(shapes: Difference) -> Vec3:
+        return _step(shapes, ties, start, _differences(_tied_points(shapes, ties, start)))
+
+    _, change = jax.jvp(step, (shapes,), (tangents[0],))
+    none = change.map(jnp.zeros_like)
+    return _implicit_normal(shapes, start, ties, exact), where(exact, change, none)
 
 
 def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
@@ -280,6 +299,7 @@ def _flat_end(
     pieces = frozen.pieces(lax.stop_gradient(normal))
     point_a, point_b = shapes.points(pieces, normal)
     other, searched = (point_a, simplex.point_a) if of_b else (point_b, simplex.point_b)
+    assert searched is not None
     offset = searched - lax.stop_gradient(other)
     tied = jnp.abs(dot(lax.stop_gradient(normal), offset)) <= 64.0 * rounding
     offset = offset * jnp.where(tied, 1.0, 0.0)

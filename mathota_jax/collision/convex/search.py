@@ -72,7 +72,7 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
     # Both searches are turns of one loop, so that they are compiled once.
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
-    state = _Lifted(jnp.zeros((), jnp.int32), _no_simplex(vector), shapes.position, vector, zero, zero > 0)
+    state = _Lifted(jnp.zeros((), jnp.int32), _no_simplex(vector, None), shapes.position, vector, zero, zero > 0)
     state = lax.while_loop(lambda s: (s.turn < 2) & ~jnp.all(s.done), turn, state)
     return state.simplex, state.upper
 
@@ -87,9 +87,9 @@ def _stalled(found: Simplex, reach: Array, tolerance: float) -> Array:
     return (found.distance < CLOSE) & (reach < found.distance - tolerance)
 
 
-def _no_simplex(zero: Vec3) -> Simplex:
+def _no_simplex(zero: Vec3, point: Vec3 | None) -> Simplex:
     none = jnp.zeros(zero.x.shape, jnp.int32)
-    return Simplex(zero, (none, none, none), zero, zero, zero.x, none < 0)
+    return Simplex(zero, (none, none, none), point, point, zero.x, none < 0)
 
 
 class _Search(NamedTuple):
@@ -135,6 +135,8 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Array]
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
     no = zero > 0
-    state = _Search(_no_simplex(vector), shapes.position, vector, jnp.asarray(LIFT, number), no, zero + jnp.inf, no)
+    state = _Search(
+        _no_simplex(vector, vector), shapes.position, vector, jnp.asarray(LIFT, number), no, zero + jnp.inf, no
+    )
     state = lax.fori_loop(0, PROOFS + 2, turn, state)
     return state.simplex, state.upper

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import settle_code
+from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.settle import compute_once, settle_code, store
 from mathota_jax.spatial.vector import Vec3, norm
 
 Parameters = dict[str, Any]
@@ -147,19 +148,34 @@ def _polyhedron_code(shape: Parameters, direction: Vec3) -> Array:
 
 def _polyhedron_point(shape: Parameters, code: Array, direction: Vec3) -> Vec3:
     vertices = shape["vertices"]
-    count = vertices.x.shape[0]
+    if vertices.x.shape[0] > UNROLLED_VERTICES:
+        return vertices.map(lambda component: _gathered(component, code))
+    if vertices.x.shape[-1] > 1:
+        return compute_once(vertices.map(lambda component: _selected(component, code)), direction.x)
+    # Corners that all worlds share are looked up in one kernel.
+    rows = jnp.stack(vertices, axis=1)
+    rows = rows.reshape(*rows.shape[:2], *(1,) * (code.ndim + 2 - rows.ndim), *rows.shape[2:])
+    found = _selected(rows, code)
+    return Vec3(*unstack(store(found, found), 0))
 
-    def selected(component: Array) -> Array:
-        if count > UNROLLED_VERTICES:
-            component = component.reshape(count, *(1,) * (code.ndim + 1 - component.ndim), *component.shape[1:])
-            full = jnp.broadcast_to(component, (count, *jnp.broadcast_shapes(component.shape[1:], code.shape)))
-            return jnp.take_along_axis(full, jnp.broadcast_to(code, full.shape[1:])[None], axis=0)[0]
-        value = jnp.broadcast_to(component[0], jnp.broadcast_shapes(component.shape[1:], code.shape))
-        for index in range(1, count):
-            value = jnp.where(code == index, component[index], value)
-        return value
 
-    return vertices.map(selected)
+def _selected(rows: Array, code: Array) -> Array:
+    """Row `code` of a few, by halving: a third fewer instructions than one comparison for each row."""
+    bit = 0
+    candidates = [rows[index] for index in range(rows.shape[0])]
+    while len(candidates) > 1:
+        odd = (code >> bit) & 1 == 1
+        pairs = zip(candidates[::2], [*candidates[1::2], None], strict=False)
+        candidates = [first if second is None else jnp.where(odd, second, first) for first, second in pairs]
+        bit += 1
+    return jnp.broadcast_to(candidates[0], jnp.broadcast_shapes(candidates[0].shape, code.shape))
+
+
+def _gathered(component: Array, code: Array) -> Array:
+    count = component.shape[0]
+    component = component.reshape(count, *(1,) * (code.ndim + 1 - component.ndim), *component.shape[1:])
+    full = jnp.broadcast_to(component, (count, *jnp.broadcast_shapes(component.shape[1:], code.shape)))
+    return jnp.take_along_axis(full, jnp.broadcast_to(code, full.shape[1:])[None], axis=0)[0]
 
 
 def _polyhedron_extent(shape: Parameters) -> Array:
