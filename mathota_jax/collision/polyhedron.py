@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
+from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.vector import Vec3, cross, normalize
 
 
@@ -35,8 +35,9 @@ def polyhedron_faces(vertices: Vec3, faces: np.ndarray) -> PolyhedronFaces:
         vertices: Components (vertex, pair, world).
         faces: int32 (pair, face, corner); faces of fewer corners repeat their last one.
     """
-    corners = take_vertices(vertices, np.moveaxis(faces, 0, -1).swapaxes(0, 1))
-    following = take_vertices(vertices, np.roll(np.moveaxis(faces, 0, -1), -1, axis=1).swapaxes(0, 1))
+    corner_numbers = np.moveaxis(faces, 0, -1).swapaxes(0, 1)
+    both = take_vertices(vertices, np.stack([corner_numbers, np.roll(corner_numbers, -1, axis=0)]))
+    corners, following = both.map(lambda c: c[0]), both.map(lambda c: c[1])
     first = corners.map(lambda c: c[:1])
     area = cross(corners - first, following - first).map(lambda c: jnp.sum(c, axis=0))
     distinct = (faces != np.roll(faces, 1, axis=2)) | (faces.shape[2] == 1)
@@ -58,11 +59,11 @@ def take_vertices(vertices: Vec3, indices: np.ndarray) -> Vec3:
     pairs = max(indices.shape[-1], vertices.x.shape[1])
     indices = np.broadcast_to(indices, (*indices.shape[:-1], pairs))
 
-    def take(component: Array) -> Array:
-        rows = np.arange(pairs) if component.shape[1] > 1 else np.zeros(pairs, np.int32)
-        return component[indices, np.broadcast_to(rows, indices.shape)]
-
-    return vertices.map(take)
+    rows = np.arange(pairs) if vertices.x.shape[1] > 1 else np.zeros(pairs, np.int32)
+    if vertices.x.shape[-1] > 1:
+        return vertices.map(lambda component: component[indices, np.broadcast_to(rows, indices.shape)])
+    # What all worlds share is taken by one operation, which is compiled once.
+    return Vec3(*unstack(jnp.stack(vertices)[:, indices, np.broadcast_to(rows, indices.shape)], 0))
 
 
 def polyhedron_edges(faces: np.ndarray) -> np.ndarray:

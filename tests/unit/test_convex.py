@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from mathota_jax import Box, Polyhedron, signed_distance
 from mathota_jax.collision.convex import SUPPORT, support
 from mathota_jax.collision.convex.support import UNROLLED_VERTICES
+from tests.benchmarks import pose_classes
 from tests.benchmarks.pose_sweep import gate as error_gate
 from tests.benchmarks.pose_sweep import measure, sweep
 from tests.convex_oracle import (
@@ -30,6 +31,7 @@ from tests.convex_oracle import (
     to_engine,
 )
 from tests.hulls import BOX_CORNERS
+from tests.polytope_oracle import polytope_distance, polytope_pairs
 
 QUICK = [("box", "polyhedron"), ("cylinder", "cone")]
 """Pairs of the normal suite; the slow one runs them all."""
@@ -85,6 +87,28 @@ def test_what_is_not_flagged_is_right(pair, kind, precision):
     wrong = ~(np.maximum(result["separation"], result["normal"]) <= error_gate(pair, precision))
     assert not (wrong & result["converged"]).any()
     assert result["converged"].mean() >= (0.7 if kind.startswith("needles") else 0.9)
+
+
+POLYTOPE_PAIRS = [
+    pytest.param(pair, id="_".join(pair), marks=() if pair == ("capsule", "polyhedron") else pytest.mark.slow)
+    for pair in polytope_pairs()
+]
+
+
+@pytest.mark.parametrize("pair", POLYTOPE_PAIRS)
+def test_separated_touching_shallow_and_deep_poses(pair, precision):
+    """Nothing wrong without a flag and no wrong sign; see `tests.benchmarks.pose_classes` for 20,000 of each pair."""
+    for row in pose_classes.measure(pair, *pose_classes.draw(pair, 2000), np.dtype(precision).name):
+        assert row["wrong_unflagged"] == row["flips"] == 0, row
+        assert row["flagged"] <= 10, row
+
+
+@pytest.mark.parametrize("pair", polytope_pairs())
+def test_the_two_oracles_agree(pair):
+    scene = random_scene(pair, 6, reach=1.5)
+    truths, _ = polytope_distance(pair, scene)
+    expected = [oracle(Placed(pair, scene, index))[0] for index in range(6)]
+    np.testing.assert_allclose(truths, expected, atol=1e-10)
 
 
 @pytest.mark.parametrize("other", ["capsule", "box"])

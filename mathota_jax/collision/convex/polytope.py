@@ -98,14 +98,11 @@ def _box(shape: dict[str, Any]) -> Polytope:
 def _polyhedron(shape: dict[str, Any]) -> Polytope:
     vertices: Vec3 = shape["vertices"]
     normals = polyhedron_faces(vertices, shape["faces"]).normal
-    start, end, left, right = edge_table(shape["faces"])
-    first = take_vertices(vertices, start)
-    edges = Edges(
-        first,
-        normalize(take_vertices(vertices, end) - first),
-        take_vertices(normals, left),
-        take_vertices(normals, right),
-    )
+    table = edge_table(shape["faces"])
+    ends, sides = take_vertices(vertices, table[:2]), take_vertices(normals, table[2:])
+    first, second = (ends.map(lambda c, k=k: c[k]) for k in range(2))
+    left, right = (sides.map(lambda c, k=k: c[k]) for k in range(2))
+    edges = Edges(first, normalize(second - first), left, right)
     return Polytope(vertices, normals, edges)
 
 

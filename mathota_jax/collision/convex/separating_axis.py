@@ -18,6 +18,7 @@ from jax import Array, lax
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.difference import Difference
 from mathota_jax.collision.convex.polytope import Edges, Polytope, row_count
+from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, where
 
@@ -67,17 +68,28 @@ def _best_of_some(wanted: Array, lanes: int, placed: _Placed) -> Axis:
     order = jnp.argsort(~wanted.reshape(-1), stable=True)
     count = jnp.sum(wanted, dtype=jnp.int32)
 
-    def test_some(state: tuple[Array, Axis]) -> tuple[Array, Axis]:
+    def test_some(state: tuple[Array, Array]) -> tuple[Array, Array]:
         turn, found = state
         chosen = lax.dynamic_slice_in_dim(order, turn * lanes, lanes)
-        some = jax.tree.map(lambda x: x if x.shape[-1] == 1 else jnp.take(x, chosen, axis=-1), flat)
-        axis = _best(some)
-        return turn + 1, jax.tree.map(lambda all_, new: all_.at[0, chosen].set(new[0]), found, axis)
+        axis = _best(_take_lanes(flat, chosen))
+        return turn + 1, found.at[:, 0, chosen].set(jnp.stack([*axis.direction, axis.separation])[:, 0])
 
-    zero = jnp.zeros((1, wanted.size), placed.position.x.dtype)
-    state = jnp.zeros((), jnp.int32), Axis(Vec3(zero, zero, zero), zero)
+    state = jnp.zeros((), jnp.int32), jnp.zeros((4, 1, wanted.size), placed.position.x.dtype)
     _, found = lax.while_loop(lambda s: s[0] * lanes < count, test_some, state)
-    return jax.tree.map(lambda x: x.reshape(wanted.shape), found)
+    x, y, z, separation = (row.reshape(wanted.shape) for row in unstack(found, 0))
+    return Axis(Vec3(x, y, z), separation)
+
+
+def _take_lanes(tree: _Placed, chosen: Array) -> _Placed:
+    """Some lanes of every array; arrays of one shape by one gather. What all share stays as it is."""
+    leaves, structure = jax.tree.flatten(tree)
+    taken = list(leaves)
+    for shape in {leaf.shape for leaf in leaves if leaf.shape[-1] > 1}:
+        places = [place for place, leaf in enumerate(leaves) if leaf.shape == shape]
+        some = jnp.take(jnp.stack([leaves[place] for place in places]), chosen, axis=-1)
+        for place, leaf in zip(places, unstack(some, 0), strict=True):
+            taken[place] = leaf
+    return jax.tree.unflatten(structure, taken)
 
 
 def _flatten(values: Array, lanes: tuple[int, ...]) -> Array:
@@ -102,7 +114,8 @@ def _best(placed: _Placed) -> Axis:
     best = jnp.where(by_b, best_b, best_a)
     if a.edges is None or b.edges is None:
         return Axis(direction, best)
-    crossed = _best_crossing(a.edges, _turned(b.edges, rotation, position))
+    turned = compute_once(rotation.apply(_packed(b.edges)), position.x)
+    crossed = _best_crossing(_packed(a.edges), turned, position)
     by_edges = settle_code((crossed.separation > best).astype(number)) == 1
     return Axis(where(by_edges, crossed.direction, direction), jnp.where(by_edges, crossed.separation, best))
 
@@ -112,38 +125,46 @@ def _support(vertices: Vec3, directions: Vec3) -> Array:
     return jnp.max(dot(vertices.map(lambda c: c[:, None]), directions.map(lambda c: c[None])), axis=0)
 
 
-def _turned(edges: Edges, rotation: Mat3, position: Vec3) -> Edges:
-    turned = Edges(rotation.apply(edges.start) + position, *(rotation.apply(v) for v in edges[1:]))
-    return compute_once(turned, position.x)
+def _packed(edges: Edges) -> Vec3:
+    """The four vectors of each edge as one, components (edge, 4, pair, world): a fourth of the kernels to compile."""
+    return Vec3(*(jnp.stack(jnp.broadcast_arrays(*components), axis=1) for components in zip(*edges, strict=True)))
 
 
-def _best_crossing(a: Edges, b: Edges) -> Axis:
-    """Best direction across an edge of A and one of B; the separation is the lowest number if no arcs cross."""
+def _unpacked(packed: Vec3) -> Edges:
+    return Edges(*(packed.map(lambda c, k=k: c[..., k, :, :]) for k in range(4)))
 
-    def of_edge(_: None, edge: Edges) -> tuple[None, Array]:
-        return None, jnp.max(_crossing(edge, b)[1], axis=0)
 
-    count = row_count(a)
-    rows = jax.tree.map(lambda c: jnp.broadcast_to(c, (count, *c.shape[1:])), a)
-    _, scores = lax.scan(of_edge, None, rows)
+def _best_crossing(a: Vec3, b: Vec3, position: Vec3) -> Axis:
+    """Best direction across an edge of A and one of B; the separation is the lowest number if no arcs cross.
+
+    Args:
+        a: Packed edges of A.
+        b: Packed edges of B, turned into the frame of A.
+        position: Of B in the frame of A.
+    """
+
+    def of_edge(_: None, edge: Vec3) -> tuple[None, Array]:
+        return None, jnp.max(_crossing(edge, b, position)[1], axis=0)
+
+    _, scores = lax.scan(of_edge, None, a)
     _, chosen = best_candidate(scores)
-    edge_a = compute_once(pick(rows, chosen), scores)
-    score, chosen = best_candidate(_crossing(edge_a, b)[1])
-    count = row_count(b)
-    edge_b = pick(jax.tree.map(lambda c: jnp.broadcast_to(c, (count, *c.shape[1:])), b), chosen)
-    across, _ = _crossing(edge_a, edge_b)
+    edge_a = compute_once(pick(a, chosen), scores)
+    score, chosen = best_candidate(_crossing(edge_a, b, position)[1])
+    edge_b = pick(b, chosen)
+    across, _ = _crossing(edge_a, edge_b, position)
     squared = dot(across, across)
     usable = score > jnp.finfo(score.dtype).min
     direction = across * lax.rsqrt(jnp.where(usable, squared, 1.0))
-    separation = dot(direction, edge_b.start - edge_a.start)
+    separation = dot(direction, _unpacked(edge_b).start + position - _unpacked(edge_a).start)
     return Axis(direction, jnp.where(usable, separation, score))
 
 
-def _crossing(a: Edges, b: Edges) -> tuple[Vec3, Array]:
+def _crossing(edge_a: Vec3, edge_b: Vec3, position: Vec3) -> tuple[Vec3, Array]:
     """Cross product of two edges, outward from A, and a number that grows with the separation along it.
 
     The number is ``separation * |separation|``, which needs no root, or the lowest one if the arcs do not cross.
     """
+    a, b = _unpacked(edge_a), _unpacked(edge_b)
     from_left, from_right = dot(a.left, b.along), dot(a.right, b.along)
     to_left, to_right = dot(b.left, a.along), dot(b.right, a.along)
     number = from_left.dtype
@@ -154,7 +175,7 @@ def _crossing(a: Edges, b: Edges) -> tuple[Vec3, Array]:
         jnp.minimum(sign * from_left, -sign * from_right), jnp.minimum(sign * to_left, -sign * to_right)
     )
     across = cross(a.along, b.along) * sign
-    height = dot(across, b.start - a.start)
+    height = dot(across, b.start + position - a.start)
     squared = dot(across, across)
     usable = (crossing > least) & (squared > 0)
     score = height * jnp.abs(height) / jnp.where(usable, squared, 1.0)

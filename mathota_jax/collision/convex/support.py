@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle_code, store
 from mathota_jax.spatial.vector import Vec3, norm
 
