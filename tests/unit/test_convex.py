@@ -111,6 +111,24 @@ def test_the_two_oracles_agree(pair):
     np.testing.assert_allclose(truths, expected, atol=1e-10)
 
 
+def test_a_corner_that_all_but_meets_a_corner(precision):
+    """A hull with a corner pressed into a face of a box by next to nothing, at 1e-6 to 1e-2 from the corner of the face."""
+    pair, count = ("box", "polyhedron"), 400
+    scene = random_scene(pair, count)
+    rng = np.random.default_rng(8)
+    turns = [Rotation.from_quat(scene["q" + side][:, [1, 2, 3, 0]]) for side in "ab"]
+    corners = scene["b"]["vertices"]
+    lowest = np.argmax(np.einsum("pck,pk->pc", corners, turns[1].inv().apply(turns[0].apply([0.0, -1.0, 0.0]))), axis=1)
+    target = scene["a"]["half_extents"] - 10 ** rng.uniform(-6, -2, (count, 3)) * [1, 0, 1]
+    target[:, 1] -= rng.uniform(1e-6, 3e-5, count)
+    scene["pb"] = scene["pa"] + turns[0].apply(target) - turns[1].apply(corners[np.arange(count), lowest])
+    scene = rounded(scene, precision)
+    truths, _ = polytope_distance(pair, scene)
+    result = Result(pair, scene, precision)
+    np.testing.assert_allclose(result.separation, truths, atol=error_gate(pair, precision))
+    assert result.converged.mean() > 0.98
+
+
 @pytest.mark.parametrize("other", ["capsule", "box"])
 def test_a_sphere_whose_centre_all_but_touches_the_core(other, precision):
     """From 1e-9 to 1e-3 off an axis, a corner, an edge or a face, in any direction: in closed form, and proved."""
