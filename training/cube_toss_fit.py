@@ -144,8 +144,8 @@ def refine(tosses: Tosses, start: Start, begin: CubeParameters, horizon: int, st
 
     best, damping = objective(begin), 1e-2
     for _ in range(steps):
-        linear = _linearise(model, state, as_arrays(model, begin), start, recorded, 2 * tosses.half_width)
-        matrix, gradient = _normal_equations(*(np.asarray(part, float) for part in linear), share)
+        errors, slopes = _linearise(model, state, as_arrays(model, begin), start, recorded, 2 * tosses.half_width)
+        matrix, gradient = _normal_equations(np.asarray(errors, float), np.asarray(slopes, float), share)
         previous = best
         while damping < 1e3:
             change = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)

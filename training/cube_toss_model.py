@@ -105,10 +105,10 @@ def errors(tosses: Tosses, setting: str, parameters: CubeParameters) -> tuple[np
 
 
 def prediction_errors(
-    tosses: Tosses, start: Start, parameters: CubeParameters, count: int | None = None
+    tosses: Tosses, start: Start, parameters: CubeParameters, frames: int | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`errors` with a start that is known already, over the first `count` frames after it; None for all."""
-    count = tosses.position.shape[1] - 1 if count is None else count
+    """`errors` with a start that is known already, over the first `frames` after it; None for all."""
+    count = tosses.position.shape[1] - 1 if frames is None else frames
     model, state = scene(tosses.dt / SUBSTEPS, tosses.mass, parameters)
     found = simulate(model, state, as_arrays(model, parameters), as_arrays(model, start), count)
     position, orientation = (np.asarray(leaf, float) for leaf in found)
