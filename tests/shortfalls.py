@@ -28,12 +28,6 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
     "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
     "its centre ends up to 77 mm in the ground",
-    "tests/training/test_cube_toss.py::test_prediction_of_tosses_not_fitted[position-recorded first frame]": "13.3 % "
-    "of the width on the odd half, 12.3 % on the fitted even half; gate 12.5 %, the best engine's on all tosses",
-    "tests/training/test_cube_toss.py::test_prediction_of_tosses_not_fitted[position-start fitted to the free flight]": ""
-    "11.7 % of the width on the odd half, 10.7 % on the fitted even half; gate 10.7 %",
-    "tests/training/test_cube_toss.py::test_prediction_of_tosses_not_fitted[rotation-start fitted to the free flight]": ""
-    "13.4 degrees; gate 13.0",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/gradients/test_bystanders.py::test_stick_and_slip[float64]": SWEEPS

@@ -1,4 +1,4 @@
-"""Fit friction, restitution and inertia to half of the tosses of a real cube and predict the others.
+"""Fit friction, restitution, inertia and centre of mass to half of the tosses of a real cube and predict the others.
 
 ``python -m training.cube_toss --data cube_toss.npz`` prints a table and writes it with ``--output FILE.md``.
 
@@ -12,7 +12,7 @@ github.com/DAIRLab/contact-nets, BSD 3-Clause), converted to one NPZ file in SI 
 
 Tosses with even index are fitted, those with odd index predicted, and then the other way round. Errors are means over the
 frames of a toss, then over tosses: distance of the centres as a share of the width of the block, and angle between the
-orientations.
+orientations. Everything that is fitted is physics of the cube, and is fitted by gradient (see `training.cube_toss_fit`).
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--data", type=Path, required=True, help="the NPZ file")
     parser.add_argument("--output", type=Path, help="Markdown file for the table")
-    parser.add_argument("--rounds", type=int, default=2, help="rounds of the random search (default 2)")
+    parser.add_argument("--steps", type=int, default=12, help="most steps of the fit to whole motions (default 12)")
     options = parser.parse_args(arguments)
     try:
         tosses = load_tosses(options.data)
-        text = report(tosses, options.rounds)
+        text = report(tosses, options.steps)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -55,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def report(tosses: Tosses, rounds: int) -> str:
+def report(tosses: Tosses, steps: int) -> str:
     """Fits and predicts in both settings; a Markdown text."""
     halves = [np.arange(tosses.count) % 2 == parity for parity in (0, 1)]
     lines = [
@@ -67,7 +67,7 @@ def report(tosses: Tosses, rounds: int) -> str:
         "| start | fitted to | predicted | position [% of width] | rotation [degree] | parameters |",
         "|---|---|---|---|---|---|",
     ]
-    estimates = [fit_tosses(tosses.take(half), SETTINGS, rounds) for half in halves]
+    estimates = [fit_tosses(tosses.take(half), SETTINGS, steps) for half in halves]
     for number, setting in enumerate(SETTINGS):
         found = []
         for parity, name, other in ((0, "even", "odd"), (1, "odd", "even")):
@@ -88,10 +88,12 @@ def _figures(position: np.ndarray, rotation: np.ndarray) -> str:
 def _describe(estimate: Estimate) -> str:
     known = estimate.parameters
     low, high = estimate.friction_interval
+    inertia = ", ".join(f"{1e3 * value:.2f}" for value in known.inertia)
+    centre = ", ".join(f"{1e3 * value:.1f}" for value in known.centre_of_mass)
     return (
         f"friction {known.friction:.3f} (first impacts {estimate.first_friction:.3f}, {low:.3f} to {high:.3f}), restitution "
-        f"{known.restitution:.3f}, inertia {known.inertia * 1e3:.3f} g m², "
-        f"corner radius {known.corner_radius * 1e3:.1f} mm, half width {known.half_width * 1e3:.2f} mm"
+        f"{known.restitution:.3f}, inertia ({inertia}) g m², corner radius {known.corner_radius * 1e3:.1f} mm, centre of "
+        f"mass ({centre}) mm off the middle, half width {known.half_width * 1e3:.2f} mm, gravity {known.gravity:.2f} m/s²"
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 GRAVITY = 9.81
+UP = np.array([0.0, 0.0, 1.0])
 CLEARANCE = 0.06
 """Height of the lowest corner over the table, as a share of the half width, above which the cube surely flies."""
 
@@ -52,6 +53,10 @@ class Tosses:
         """Some of the tosses."""
         return dataclasses.replace(self, **{name: getattr(self, name)[mask] for name in SHAPES})
 
+    def seen(self, count: int) -> np.ndarray:
+        """(toss, count) which frames after the first are valid."""
+        return np.arange(1, count + 1)[None] < self.length[:, None]
+
     def lowest_corner(self) -> np.ndarray:
         """(toss, frame) height of the lowest corner of the cube as given [m]."""
         w, x, y, z = np.moveaxis(self.orientation, -1, 0)
@@ -66,32 +71,76 @@ class Tosses:
         """Median height of the centre in the last frame: the half width that the cube rests on."""
         return float(np.median(self.position[np.arange(self.count), self.length - 1, 2]))
 
-    def recorded_start(self) -> tuple[np.ndarray, ...]:
-        """Position, orientation, velocity and angular velocity in the first frame, (toss, 3 or 4).
+    def gravity(self) -> float:
+        """Acceleration of free fall in lengths as recorded, which are short by the ratio of the two half widths."""
+        return GRAVITY * self.resting_half_width() / self.half_width
+
+    def centre_of_mass(self) -> np.ndarray:
+        """(3,) from the recorded centre of the cube, body frame [m].
+
+        In flight the centre of mass follows a parabola and the recorded one turns about it: linear least squares over the
+        flights of all tosses.
+        """
+        columns, sides = [], []
+        for toss, frames in enumerate(self.flight_length()):
+            time = np.arange(frames) * self.dt
+            design = np.stack([np.ones(frames), time], 1)
+            without_line = np.eye(frames) - design @ np.linalg.pinv(design)
+            axes = as_rotation(self.orientation[toss, :frames]).as_matrix()
+            risen = self.position[toss, :frames] + fall(self.gravity(), time)
+            columns.append(np.tensordot(without_line, axes, 1).reshape(-1, 3))
+            sides.append((without_line @ risen).ravel())
+        return -np.linalg.lstsq(np.concatenate(columns), np.concatenate(sides), rcond=None)[0]
+
+    def recorded_start(self, centre: np.ndarray, gravity: float) -> tuple[np.ndarray, ...]:
+        """Position and velocity of the centre of mass, orientation and angular velocity in the first frame, (toss, 3 or 4).
 
         The recorded velocity is a backward difference and so that of half a frame earlier.
-        """
-        velocity = self.velocity[:, 0].copy()
-        velocity[:, 2] -= GRAVITY * self.dt / 2
-        return self.position[:, 0], self.orientation[:, 0], velocity, self.angular_velocity[:, 0]
 
-    def flight_start(self) -> tuple[np.ndarray, ...]:
+        Args:
+            centre: of mass from the recorded centre, body frame [m].
+            gravity: [m/s^2], in lengths as recorded.
+        """
+        rate = self.angular_velocity[:, 0]
+        arm = as_rotation(self.orientation[:, 0]).apply(centre)
+        velocity = self.velocity[:, 0] - fall(gravity, self.dt) / self.dt + np.cross(rate, arm)
+        return self.position[:, 0] + arm, self.orientation[:, 0], velocity, rate
+
+    def flight_start(self, centre: np.ndarray, gravity: float) -> tuple[np.ndarray, ...]:
         """The same from least squares over all frames of the flight: a parabola, and a turn at a constant rate."""
-        rows = [self._flight(toss, frames) for toss, frames in enumerate(self.flight_length())]
+        rows = [self._flight(toss, frames, centre, gravity) for toss, frames in enumerate(self.flight_length())]
         return tuple(np.stack(parts) for parts in zip(*rows, strict=True))
 
-    def _flight(self, toss: int, frames: int) -> tuple[np.ndarray, ...]:
+    def _flight(self, toss: int, frames: int, centre: np.ndarray, gravity: float) -> tuple[np.ndarray, ...]:
         time = np.arange(frames) * self.dt
         design = np.stack([np.ones(frames), time], 1)
-        fall = np.outer(GRAVITY * time**2 / 2, [0.0, 0.0, 1.0])
-        position, velocity = np.linalg.lstsq(design, self.position[toss, :frames] + fall, rcond=None)[0]
-        seen = Rotation.from_quat(self.orientation[toss, :frames][:, [1, 2, 3, 0]])
+        seen = as_rotation(self.orientation[toss, :frames])
         begin, rate = seen[0], self.angular_velocity[toss, 0].copy()
         for _ in range(20):  # Gauss-Newton with the Jacobian of small turns: linear convergence
             error = (seen * (Rotation.from_rotvec(rate * time[:, None]) * begin).inv()).as_rotvec()
             turn, change = np.linalg.lstsq(design, error, rcond=None)[0]
             begin, rate = Rotation.from_rotvec(turn) * begin, rate + change
+        risen = self.position[toss, :frames] + seen.apply(centre) + fall(gravity, time)
+        position, velocity = np.linalg.lstsq(design, risen, rcond=None)[0]
         return position, begin.as_quat()[[3, 0, 1, 2]], velocity, rate
+
+
+def as_rotation(orientation: np.ndarray) -> Rotation:
+    """Of quaternions (..., 4), w first."""
+    return Rotation.from_quat(orientation[..., [1, 2, 3, 0]])
+
+
+def turned(orientation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """(toss, frame, 3) a vector of the body frame in the world; NaN where the orientation is."""
+    seen = np.isfinite(orientation[..., 0])
+    whole = np.where(seen[..., None], orientation, [1.0, 0.0, 0.0, 0.0])
+    found = as_rotation(whole.reshape(-1, 4)).apply(vector).reshape(*seen.shape, 3)
+    return np.where(seen[..., None], found, np.nan)
+
+
+def fall(gravity: float, time: np.ndarray | float) -> np.ndarray:
+    """How far things fall from rest, (..., 3)."""
+    return np.multiply.outer(gravity * np.square(time) / 2, UP)
 
 
 def load_tosses(path: Path) -> Tosses:
