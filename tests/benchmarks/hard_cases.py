@@ -292,7 +292,7 @@ def _loaded_pyramid(ratio: float) -> Case:
         10.0,
         lambda run: bearing(run, slice(1, None), 1.0),
         BEARS,
-        ("pgs", "soft_step"),
+        ALL,
         (),
     )
 
@@ -381,8 +381,8 @@ CASES: tuple[Case, ...] = (
         ("soft_step",),
         peers="Box3D: a wall of base 80 falls after 1000 steps",
     ),
-    _card_house(1 / 60, ("pgs", "soft_step"), ()),
-    _card_house(1 / 240, ("pgs", "soft_step"), ("soft_step",)),
+    _card_house(1 / 60, ALL, ()),
+    _card_house(1 / 240, ALL, ("soft_step", "converged")),
     Case(
         "B5b",
         "tower of 102 planks, dt 0.01",
