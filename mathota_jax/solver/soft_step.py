@@ -49,8 +49,11 @@ HARDNESS = PHASE * (2.0 * DAMPING_RATIO + PHASE)
 """Response of a row to its own impulse, divided by its softness."""
 
 OVER_RELAXATION = 1.4
-"""Of joints, and of contacts and stops that carried something before; an impact gets its exact step. Measured on 10 to 40
+"""Of joints, and of stops that carried something before; an impact gets its exact step. Measured on 10 to 40
 loads: at 1 it sloshes for seconds, from 1.3 to 1.5 it comes to rest within one, at 1.7 it diverges."""
+
+CONTACT_OVER_RELAXATION = 1.5
+"""Likewise of contacts. With 1.4 a wall of 210 cubes sways out of its plane four times as far; with 1.5 chains open more."""
 
 MANIFOLD_PASSES = 3
 """Projected passes over the points of a manifold in one turn; for a box on its face they leave 4 % of the error."""
@@ -132,7 +135,7 @@ class Manifold:
                 residual = residual + self.softness * new
             new = jnp.maximum(new - mass * residual, 0.0)
         if self.lasting is not None:
-            new = jnp.maximum(old + jnp.where(self.lasting, OVER_RELAXATION, 1.0) * (new - old), 0.0)
+            new = jnp.maximum(old + jnp.where(self.lasting, CONTACT_OVER_RELAXATION, 1.0) * (new - old), 0.0)
         if isinstance(self.base, Cone):
             return self.base.with_friction(new, (impulse[1], impulse[2]), (error[1], error[2]))
         return new[None]
