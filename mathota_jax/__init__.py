@@ -35,7 +35,7 @@ from mathota_jax.queries import (
 )
 from mathota_jax.residuals import JointGaps, Residuals, joint_gaps, penetration, residuals
 from mathota_jax.scene import Scene
-from mathota_jax.state import Flag, Sleep, State, apply_force
+from mathota_jax.state import EndForces, Flag, Sleep, State, apply_force
 from mathota_jax.step import rollout, step
 from mathota_jax.time_stepping import Frame, advance, interpolate, substep
 
@@ -52,6 +52,7 @@ __all__ = [
     "Contacts",
     "Cylinder",
     "Distance",
+    "EndForces",
     "Fixed",
     "Flag",
     "Frame",

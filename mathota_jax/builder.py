@@ -23,7 +23,7 @@ from mathota_jax.options import Options
 from mathota_jax.rotation import rotate
 from mathota_jax.scene import JointEntry, MotorEntry, PairGroup, Scene, ShapeEntry
 from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
-from mathota_jax.state import Sleep, State
+from mathota_jax.state import EndForces, Sleep, State
 
 
 class SceneBuilder:
@@ -280,6 +280,7 @@ class SceneBuilder:
         bodies = self._bodies
         position = _floats([body.position for body in bodies])
         orientation = _floats([body.orientation for body in bodies])
+        contact_force, joint_force = _floats(np.zeros((scene.slot_count, 3))), _floats(np.zeros(joint_row_count(scene)))
         return State(
             position=position,
             orientation=orientation,
@@ -287,9 +288,9 @@ class SceneBuilder:
             angular_velocity=_floats([body.angular_velocity for body in bodies]),
             applied_force=_floats(np.zeros((len(bodies), 3))),
             applied_torque=_floats(np.zeros((len(bodies), 3))),
-            contact_force=_floats(np.zeros((scene.slot_count, 3))),
+            contact_force=contact_force,
             contact_feature=jnp.full(scene.slot_count, -1, jnp.int32),
-            joint_force=_floats(np.zeros(joint_row_count(scene))),
+            joint_force=joint_force,
             flags=jnp.zeros((), jnp.int32),
             contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
             sleep=Sleep(
@@ -299,6 +300,7 @@ class SceneBuilder:
             )
             if scene.options.sleep
             else None,
+            end_forces=EndForces(contact_force, joint_force) if scene.options.solver == "soft_step" else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:

@@ -114,7 +114,8 @@ def _state_bytes(model: Model) -> int:
     """Bytes of a `State` of one world."""
     scene = model.scene
     number = model.dt.dtype.itemsize
-    floats = scene.body_count * FLOATS_OF_A_BODY + 3 * scene.slot_count + joint_row_count(scene)
+    forces = 3 * scene.slot_count + joint_row_count(scene)
+    floats = scene.body_count * FLOATS_OF_A_BODY + forces * (2 if scene.options.solver == "soft_step" else 1)
     integers = scene.slot_count + 1 + scene.place_count
     sleep = scene.body_count * (8 * number + 1) if scene.options.sleep else 0
     return floats * number + integers * 4 + sleep

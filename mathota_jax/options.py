@@ -51,7 +51,7 @@ class Options:
         which also take out position errors and are differentiated as they are: for stacks and piles of like masses at the
         price of "pgs". Cubes of 1 m at 60 Hz: a cold stack of 10 dips 6 mm, with "pgs" 39 mm; one of 20 stands, which with
         "pgs" it does not (60 Hz; 2.1 against 1.9 CPU-ms a step). It is none for large mass ratios (100 : 1 slides off) or
-        chains (ten links open by 1.4 %, "pgs" 1 %), and a load sinks into what it rests on by
+        chains (ten links open by 1 %, "pgs" 1e-6), and a load sinks into what it rests on by
         ``load / (2 effective mass * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`,
         `baumgarte` and `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its
         restitution pass. All figures: docs/solvers.md.

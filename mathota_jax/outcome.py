@@ -20,7 +20,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.state import Flag, State
+from mathota_jax.state import EndForces, Flag, State
 
 
 def new_state(scene: Scene, state: State, moved: Bodies, kept: dict[str, Array], failed: Array | None = None) -> State:
@@ -58,21 +58,36 @@ def new_state(scene: Scene, state: State, moved: Bodies, kept: dict[str, Array],
 
 def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[str, Array]:
     """Mean forces over the step and what they belong to, in the form in which the state keeps them; new flags."""
-    scene, count = model.scene, len(problem.joint_rows)
-    changes: dict[str, Array] = {}
-    if problem.joints is not None:
-        tables = [rows.table for rows in problem.joint_rows]
-        values = [impulse[:, 0] / model.dt for impulse in impulses[:count]]
-        changes["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
+    scene = model.scene
+    changes = _mean_forces(scene, problem, impulses, model.dt)
     if problem.contacts is not None:
-        impulses = impulses[count:]
-        changes["contact_force"] = contact.slot_force(problem.contact_rows, list(impulses), scene.slot_count, model.dt)
         changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
         if problem.contacts.converged is not None or problem.close is not None:
             changes["flags"] = _collision_flags(problem.contacts, problem.close)
         if problem.close is not None:
             changes["contact_pair"] = compact.pair_keys(scene, problem.close)
     return changes
+
+
+def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tuple[Array, ...]) -> EndForces:
+    """Mean forces over the last substep, from its impulses."""
+    scene = model.scene
+    found = _mean_forces(scene, problem, impulses, model.dt / scene.options.substep_count)
+    return dataclasses.replace(before, **found)
+
+
+def _mean_forces(scene: Scene, problem: Problem, impulses: tuple[Array, ...], time: Array) -> dict[str, Array]:
+    """Of joints and contacts, where there are any."""
+    found, count = {}, len(problem.joint_rows)
+    if problem.joints is not None:
+        tables = [rows.table for rows in problem.joint_rows]
+        values = [impulse[:, 0] / time for impulse in impulses[:count]]
+        found["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
+    if problem.contacts is not None:
+        found["contact_force"] = contact.slot_force(
+            problem.contact_rows, list(impulses[count:]), scene.slot_count, time
+        )
+    return found
 
 
 def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> Array:

@@ -126,8 +126,8 @@ def _gradient_iterations(scene: Scene, iterations: int) -> int:
 
 def small_steps(
     model: Model, problem: Problem, blocks: Bodies, free: Array, start: tuple[Array, ...]
-) -> tuple[Array, Array, tuple[Array, ...]]:
-    """Phases 5 to 7 in small steps: velocities, displacements by the impulses, and the impulses of the whole step."""
+) -> tuple[Array, Array, tuple[Array, ...], tuple[Array, ...]]:
+    """Phases 5 to 7 in small steps: velocities, displacements by the impulses; impulses of the whole step and of its end."""
     scene, options, rows = model.scene, model.scene.options, problem.rows
     begin = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
     worlds = max([begin.shape[-1], free.shape[-1], *(group.bias.shape[-1] for group in rows)])
@@ -135,8 +135,10 @@ def small_steps(
     count = options.substep_count
     start = tuple(impulse / count for impulse in start)
     rebound_sweeps = options.velocity_iterations if scene.restitution and problem.contact_rows else 0
-    added, gained, impulses = soft_step.solve(count, rebound_sweeps, rows, problem.errors, begin, free, start, model.dt)
-    return free + added, gained, impulses
+    added, gained, (total, last) = soft_step.solve(
+        count, rebound_sweeps, rows, problem.errors, begin, free, start, model.dt
+    )
+    return free + added, gained, total, last
 
 
 def correct_positions(

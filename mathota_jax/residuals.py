@@ -99,7 +99,9 @@ class _Slots(NamedTuple):
 def _slots(model: Model, state: State, bodies: Bodies) -> _Slots:
     scene = model.scene
     contacts, close = find_slots(model, bodies, None)
-    return _Slots(contacts, *bodies_of_slots(scene, close), matched_force(scene, contacts, close, state))
+    return _Slots(
+        contacts, *bodies_of_slots(scene, close), matched_force(scene, contacts, close, state, state.contact_force)
+    )
 
 
 @batch_last

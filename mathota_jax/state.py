@@ -47,6 +47,22 @@ class Sleep:
 
 
 @pytree
+class EndForces:
+    """Forces at the end of the last step, from which the small steps start; in scenes with ``solver="soft_step"`` alone.
+
+    The mean forces of a step are late by half of it. Sweeps that start from them lag behind a load that changes, which
+    acts like a damper of the wrong sign: a stack of twenty swayed ever more.
+
+    Attributes:
+      contact_force: (slot, 3) on body B of each contact slot, mean of the last substep [N], world frame.
+      joint_force: (joint row,) mean generalized force of the last substep [N] or [N m].
+    """
+
+    contact_force: Array
+    joint_force: Array
+
+
+@pytree
 class State:
     """State of one world (or of many, with leading axes, under `jax.vmap`).
 
@@ -67,6 +83,7 @@ class State:
       contact_pair: (place,) pair that held each place of the compact groups in the last step, ``first * shapes + second``
         in the numbering of the broadphase, -1 for none; None in scenes without broadphase.
       sleep: timers of the sleeping system; None unless `Options.sleep`.
+      end_forces: from which the small steps start; None unless ``Options.solver`` is "soft_step".
     """
 
     position: Array
@@ -81,6 +98,7 @@ class State:
     flags: Array
     contact_pair: Array | None = None
     sleep: Sleep | None = None
+    end_forces: EndForces | None = None
 
 
 def apply_force(state: State, body: int, force: Array, point: Array | None = None) -> State:

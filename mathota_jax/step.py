@@ -18,7 +18,7 @@ from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
 from mathota_jax.model import Model
-from mathota_jax.outcome import forces, new_state
+from mathota_jax.outcome import end_forces, forces, new_state
 from mathota_jax.phases import (
     acting_inertia,
     close_joints,
@@ -74,6 +74,11 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
         raise ValueError(
             f"step: the model was built with Options(sleep={scene.options.sleep}), the state was not; take both from one "
             "call of build"
+        )
+    if (state.end_forces is not None) != (scene.options.solver == "soft_step"):
+        raise ValueError(
+            f"step: the model was built with Options(solver={scene.options.solver!r}), the state was not; take both from "
+            "one call of build"
         )
     return _batched_step(model, state, action)
 
@@ -156,9 +161,9 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
         start = known_impulses(model, problem, known)
     else:
         start = starting_impulses(model, state, problem, acting, packed)
-    lever, beyond, gained, failed = None, None, None, None
+    lever, beyond, gained, failed, last = None, None, None, None, None
     if scene.options.solver == "soft_step":
-        solved, gained, impulses = small_steps(model, problem, blocks, packed, start)
+        solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
         solved, impulses, failed = solve_rows(scene, problem, packed, start, known is not None)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
@@ -171,6 +176,8 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
     if problem.held is not None:
         moved = close_joints(model, bodies, moved)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
+    if last is not None and state.end_forces is not None:
+        new = dataclasses.replace(new, end_forces=end_forces(model, problem, state.end_forces, last))
     return let_sleep(model, state, new, action, problem) if scene.options.sleep else new
 
 

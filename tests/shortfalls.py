@@ -12,19 +12,24 @@ SHORTFALLS: dict[str, str] = {
         "a closed loop whose rows contradict each other (a rod 1.6 m longer than the linkage can reach) gains speed without "
         "bound and is NaN after 34 steps of 1/240 s; Flag.NON_FINITE is set. Loops whose rows agree stay finite and closed"
     ),
-    "tests/physics/test_soft_step.py::test_chain_holds[10]": "the whip of the free end opens a joint by 1.41 % of a link "
-    "for one step of 600, gate 1 %",
-    "tests/physics/test_soft_step.py::test_stack_stands[40]": "forty cubes stand, but lean by 0.20 m, gate 10 mm: with a "
-    "longer step of the friction they do not, and a lone cube rocks",
+    **{
+        f"tests/physics/test_soft_step.py::test_slab_that_sticks_does_not_creep[{precision}]": "no creep, but a start from "
+        "nothing: at 40 degrees the slab slides 0.144 mm in the first step and no further in 3 s, gate 0.1 mm"
+        for precision in ("float32", "float64")
+    },
+    "tests/physics/test_soft_step.py::test_boxes_on_one_point_separate[0.0]": "boxes that coincide exactly leave in one "
+    "line, each by the push-out velocity from the next: the last at 18 m/s, gate 4.5; 1e-4 apart they keep to 2.95 m/s",
     "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
     "within 10 s of steps of 1/60 s; the other solvers hold them to 7e-6 of a link, as trees that are solved exactly",
+    "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
+    "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
+    "positions, whose linear systems the two modes solve by a few sweeps each",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.5 % is lost in 10 s: mean squared error 2.3e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps",
-    "tests/physics/test_hard_scenes.py::test_gates[B4 wall of 210 cubes-soft_step]": "stands for 2000 steps and sinks by "
-    "7e-5 of its size, but sways out of its plane, three times as far every 6 s: the top one by 2.9 % of the size, gate 1 %",
-    "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0; "
-    "21 with the default solver",
+    "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
+    "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
+    "the converged solver's rest; 21 with the default solver, none with the converged one",
     "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
     "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
     "its centre ends up to 77 mm in the ground",

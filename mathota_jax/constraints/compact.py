@@ -26,7 +26,7 @@ from mathota_jax.solver.colouring import edge_colours
 from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.chunks import map_filled
-from mathota_jax.spatial.indexing import gather, take
+from mathota_jax.spatial.indexing import gather, in_every_world, take
 from mathota_jax.spatial.vector import Vec3, norm
 
 NO_PAIR = -1
@@ -200,6 +200,7 @@ def _previous_places(scene: Scene, found: PairList, pair: Array) -> Array:
     """(listed pair, world) place that held the pair in the last step, -1 for none."""
     keys = jnp.where(found.active, _key(scene, found.first, found.second), jnp.iinfo(jnp.int32).max)
     count = keys.shape[0]
+    pair = in_every_world(pair, max(pair.shape[-1], keys.shape[-1]))
     where = lower_bound(keys, pair)
     same = (pair != NO_PAIR) & (where < count) & (gather(keys, jnp.minimum(where, count - 1)) == pair)
     places = jnp.broadcast_to(jnp.arange(pair.shape[0], dtype=jnp.int32)[:, None], where.shape)

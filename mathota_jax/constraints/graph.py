@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -99,7 +102,7 @@ def _touching(model: Model, contacts: ContactSet, slots: slice, first: Array, se
 
 def keep_forces(
     model: Model, old: State, new: State, close: compact.ClosePairs | None, sleepers: Array
-) -> dict[str, Array]:
+) -> dict[str, Any]:
     """Forces of contacts and joints after the step; those between sleeping bodies stay what they were.
 
     Args:
@@ -110,19 +113,37 @@ def keep_forces(
     """
     scene = model.scene
     quiet = sleepers | jnp.asarray(scene.static)[:, None]
-    changes: dict[str, Array] = {}
+    joint_quiet = slot_quiet = None
+    changes: dict[str, Any] = {}
     if scene.joints:
         rows = [(scene.joints[j].parent, scene.joints[j].child) for group in joint_groups(scene)
                 for _ in range(group.row_count) for j in group.joints]  # fmt: skip
         parent, child = (np.asarray(side) for side in zip(*rows, strict=True))
-        changes["joint_force"] = jnp.where(quiet[parent] & quiet[child], old.joint_force, new.joint_force)
+        joint_quiet = quiet[parent] & quiet[child]
     if scene.slot_count:
-        force, feature = old.contact_force, old.contact_feature
-        if close is not None:
-            assert old.contact_pair is not None
-            force, feature = compact.carried(scene, close, force, feature, old.contact_pair)
         first, second = bodies_of_slots(scene, close)
-        keeps = gather(quiet, first) & gather(quiet, second)
-        changes["contact_force"] = jnp.where(keeps[:, None], force, new.contact_force)
-        changes["contact_feature"] = jnp.where(keeps, feature, new.contact_feature)
+        slot_quiet = gather(quiet, first) & gather(quiet, second)
+        feature = _in_present_slots(scene, close, old, old.contact_force)[1]
+        changes["contact_feature"] = jnp.where(slot_quiet, feature, new.contact_feature)
+
+    def kept(before: Any, after: Any) -> dict[str, Array]:
+        found = {}
+        if joint_quiet is not None:
+            found["joint_force"] = jnp.where(joint_quiet, before.joint_force, after.joint_force)
+        if slot_quiet is not None:
+            force = _in_present_slots(scene, close, old, before.contact_force)[0]
+            found["contact_force"] = jnp.where(slot_quiet[:, None], force, after.contact_force)
+        return found
+
+    changes.update(kept(old, new))
+    if new.end_forces is not None:
+        changes["end_forces"] = dataclasses.replace(new.end_forces, **kept(old.end_forces, new.end_forces))
     return changes
+
+
+def _in_present_slots(scene: Scene, close: compact.ClosePairs | None, old: State, force: Array) -> tuple[Array, Array]:
+    """Forces (slot, 3, world) of the last step, and their features, in the slots where their pairs are now."""
+    if close is None:
+        return force, old.contact_feature
+    assert old.contact_pair is not None
+    return compact.carried(scene, close, force, old.contact_feature, old.contact_pair)

@@ -139,10 +139,11 @@ def starting_impulses(
     """Impulses to start from: those of the last step where rows and features are the same (guide 12.4)."""
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
+    last = state if state.end_forces is None else state.end_forces
     if problem.contacts is None:
-        return _impulses(model, problem, state.joint_force, None)
-    force = compute_once(matched_force(model.scene, problem.contacts, problem.close, state), state.position)
-    start = _impulses(model, problem, state.joint_force, force)
+        return _impulses(model, problem, last.joint_force, None)
+    force = matched_force(model.scene, problem.contacts, problem.close, state, last.contact_force)
+    start = _impulses(model, problem, last.joint_force, compute_once(force, state.position))
     if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
         return warm_start.plausible(problem.rows, inertia, velocity, start)
     return start

@@ -46,9 +46,17 @@ def bodies_of_slots(scene: Scene, close: compact.ClosePairs | None) -> tuple[Arr
     return first, second
 
 
-def matched_force(scene: Scene, contacts: ContactSet, close: compact.ClosePairs | None, state: State) -> Vec3:
-    """Forces (slot, world) of the last step in the slots where their pairs and features are now; 0 for new ones."""
-    old, feature = vector(state.contact_force), state.contact_feature
+def matched_force(
+    scene: Scene, contacts: ContactSet, close: compact.ClosePairs | None, state: State, force: Array
+) -> Vec3:
+    """Forces (slot, world) of the last step in the slots where their pairs and features are now; 0 for new ones.
+
+    Args:
+      scene, contacts, close: static structure, and what is close in this step.
+      state: of the last step.
+      force: (slot, 3, world) where they were then.
+    """
+    old, feature = vector(force), state.contact_feature
     parts = warm_start.matched_force(scene, contacts, old, feature)
     if close is not None:
         assert state.contact_pair is not None

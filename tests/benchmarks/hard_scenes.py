@@ -181,6 +181,31 @@ def chain(
     return model, dataclasses.replace(state, position=state.position * spacing)
 
 
+def bridge(links: int, options: Options) -> Built:
+    """B7b: boxes of 1 x 0.25 m in a row, jointed, the first and the last also to the ground: a closed loop."""
+    builder = SceneBuilder(gravity=DOWN)
+    ground = builder.add_body(Sphere(0.1), static=True, collides=False)
+    parent = ground
+    for index in range(links):
+        child = builder.add_body(
+            Box((0.5, 0.125, 0.125)), density=20.0, position=(index + 0.5, 0.0, 0.0), collides=False
+        )
+        builder.add_joint(Hinge(parent=parent, child=child, anchor=(index, 0.0, 0.0), axis=(0, 0, 1)))
+        parent = child
+    builder.add_joint(Hinge(parent=parent, child=ground, anchor=(links, 0.0, 0.0), axis=(0, 0, 1)))
+    return builder.build(options)
+
+
+def bridge_gaps(position: np.ndarray, orientation: np.ndarray, links: int) -> np.ndarray:
+    """`joint_gaps` of a bridge, (step, links + 1)."""
+    position = position[:, 1:]
+    along = rotation_matrix(orientation[:, 1:])[..., :, 0]
+    starts, ends = position - 0.5 * along, position + 0.5 * along
+    far = np.broadcast_to(np.array([float(links), 0.0, 0.0]), ends[:, :1].shape)
+    gaps = np.concatenate([starts, far], axis=1) - np.concatenate([np.zeros_like(far), ends], axis=1)
+    return np.linalg.norm(gaps, axis=-1)
+
+
 def joint_gaps(position: np.ndarray, orientation: np.ndarray, links: int) -> np.ndarray:
     """Distances [m] (step, joint) between the ends of neighbouring links, the first against the fixed point.
 

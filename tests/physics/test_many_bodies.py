@@ -83,6 +83,20 @@ def test_same_contacts_of_boxes(float64, gate):
         np.testing.assert_allclose(found[pair], separations, atol=1e-12)
 
 
+def test_worlds_may_share_what_the_last_step_found():
+    """A batch over the positions alone: the pairs and forces of the last step are one for all worlds."""
+    model, state = heap(3, broadphase="all_pairs")
+    lift = jnp.array([0.0, 0.05, 0.1], state.position.dtype)
+
+    def lifted(by):
+        return step(model, dataclasses.replace(state, position=state.position.at[1:, 1].add(by)))
+
+    together = jax.jit(jax.vmap(lifted))(lift)
+    alone = stack([jax.jit(lifted)(by) for by in lift])
+    np.testing.assert_allclose(together.position, alone.position, atol=1e-6)
+    np.testing.assert_allclose(together.velocity, alone.velocity, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_same_gradient_as_with_a_slot_for_every_pair(float64, gate):
     """Through a broadphase, a colouring and a solver with traced indices, in reverse mode and in forward mode."""
