@@ -24,6 +24,8 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
     "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
     "positions, whose linear systems the two modes solve by a few sweeps each",
+    "tests/physics/test_soft_step.py::test_sleep_fast_bodies_and_a_step_of_no_time": "the damping of a whole step is that "
+    "of its start: a ball stopped from 180 m/s leaves the wall at 0.022 m/s and is 21 mm away after a second, gate 10 mm",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.5 % is lost in 10 s: mean squared error 2.3e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps",
@@ -49,10 +51,6 @@ SHORTFALLS: dict[str, str] = {
     + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
     "tests/unit/test_state.py::test_nothing_assumes_an_up_axis": "the order of the sweeps follows the axes of the tangents: "
     "3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6",
-    "tests/physics/test_stack.py::test_ten_boxes_stand": "the stack dips 2.3 mm while the first sweeps start from nothing, "
-    "then stands 0.5 mm below its start (see test_ten_boxes_stay_in_place), gate 1 mm at any time",
-    "tests/physics/test_warm_start.py::test_order_of_the_bodies_does_not_matter[float32]": "balls of 1, 1 and 100 kg on one "
-    "another are balanced on a point: round-off grows 19-fold in ten steps and the pile falls another way, gate 1e-4",
     **{
         f"tests/unit/test_converged.py::test_contact_laws_hold[{case}-10000.0]": "mass ratio 1e4 among bodies hit at "
         "random points, from nothing: the converged solver reaches its limit of 150 iterations or misses the gate"

@@ -30,7 +30,7 @@ from mathota_jax.constraints.assembly import (
     smaller_side,
     turn_of_points,
 )
-from mathota_jax.constraints.effective_mass import entries_of, row_bound
+from mathota_jax.constraints.effective_mass import entries_of, normal_bound, tangent_bound
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -163,12 +163,12 @@ def contact_rows(
     active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
     # Empty columns of a table have no response.
     entries = entries_of(matrix.dense())
-    mass = safe_divide(active, row_bound(entries, table.together, active, (0,)))
+    mass = safe_divide(active, normal_bound(entries, table.together, active))
     bias = [-target]
     if scene.friction:
         law = Cone(
             normal_mass=mass,
-            tangent_mass=safe_divide(active, row_bound(entries, table.together, active, (1, 2))),
+            tangent_mass=safe_divide(active, tangent_bound(entries, table.together, active)),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
         )
         bias += [jnp.zeros(()), jnp.zeros(())]

@@ -14,16 +14,21 @@ from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_sqrt
 from mathota_jax.spatial.settle import compute_once, materialize
+from mathota_jax.spatial.spread import add_slices
 
 Entries = list[list[list[Array]]]
 """Components (turn, column, world) by side and row."""
 
-RELAXATION = 4 / 3
-"""Factor on the bounded step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1."""
+NORMAL_RELAXATION = 10 / 9
+"""Factor on the bounded normal step of three points and more: makes it exact for a cube on its face."""
+
+TANGENT_RELAXATION = 4 / 3
+"""Factor on the bounded tangential step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1;
+against the largest eigenvalue itself, boxes that were dropped creep."""
 
 
 def entries_of(matrix: Dense) -> tuple[Entries, Entries]:
-    """Entries of Jacobian and response for `row_bound`."""
+    """Entries of Jacobian and response for the bounds below."""
     # The length of a step does not move the fixed point: its derivative is not worth computing.
     matrix = jax.lax.stop_gradient(matrix)
     jacobian, response = (
@@ -33,31 +38,50 @@ def entries_of(matrix: Dense) -> tuple[Entries, Entries]:
     return jacobian, response
 
 
-def row_bound(entries: tuple[Entries, Entries], together: int, active: Array, rows: tuple[int, ...]) -> Array:
-    """Bound (turn, column, world) of the response of each point to impulses on all points of its manifold, along `rows`.
+def normal_bound(entries: tuple[Entries, Entries], together: int, active: Array) -> Array:
+    """Bound (turn, column, world) of the response of the points of a manifold to normal impulses on all of them.
 
     The points of a manifold are solved together, which keeps the symmetry of a stack: solved one after the other they
-    tilt it. A step divided by the sum of the norms of the blocks ``J_i M^-1 J_j^T`` over j can not overshoot
-    (Gershgorin); the steps are lengthened by a constant, which is safe below 2. A point alone gets its exact effective
-    mass.
+    tilt it. A step divided by the largest eigenvalue of the matrix of all ``J_i M^-1 J_j^T`` can not overshoot. At most
+    three of its eigenvalues are not 0, since two bodies approach at points of one plane in three ways only; so trace and
+    Frobenius norm bound the largest one within a third, and exactly for one or two points or where one eigenvalue dominates
+    (Wolkowicz and Styan 1980, theorem 2.1). A point alone gets its exact effective mass.
     """
     jacobian, response = entries
-    total = _largest_eigenvalue(jacobian, response, rows)
+    own = _largest_eigenvalue(jacobian, response, (0,))
     if together == 1:
-        return compute_once(total, active)
+        return compute_once(own, active)
+    points = active.reshape(active.shape[0], -1, together, active.shape[-1])
+    squared = _block(entries, together, 0, 0) ** 2 * (points[:, :, :, None] * points[:, :, None])
+    norm = add_slices(add_slices(squared, 2), 2)
+    trace = add_slices(own.reshape(points.shape) * points, 2)
+    rank = jnp.clip(add_slices(points, 2), 1.0, 3.0)
+    bound = (trace + safe_sqrt(jnp.maximum((rank - 1.0) * (rank * norm - trace * trace), 0.0))) / rank
+    bound = bound / jnp.where(rank > 2.0, NORMAL_RELAXATION, 1.0)
+    return compute_once(jnp.repeat(bound, together, axis=1), active)
 
-    def block(row: int, column: int) -> Array:
-        return point_responses([side[row] for side in jacobian], [side[column] for side in response], together)
 
-    blocks = [block(row, column) for row in rows for column in rows]
-    if len(blocks) > 1:
-        # All in one kernel is not vectorised, and takes ten times as long.
-        blocks = materialize(blocks)
-    squared = sum((part**2 for part in blocks), jnp.zeros(()))
+def tangent_bound(entries: tuple[Entries, Entries], together: int, active: Array) -> Array:
+    """The same for impulses along the tangents: the sum of the norms of the blocks of a point (Gershgorin), relaxed.
+
+    A step must not overshoot at all here: what a friction impulse may be changes with the normal impulses.
+    """
+    own = _largest_eigenvalue(*entries, (1, 2))
+    if together == 1:
+        return compute_once(own, active)
+    # All in one kernel is not vectorised, and takes ten times as long.
+    blocks = materialize([_block(entries, together, row, column) for row in (1, 2) for column in (1, 2)])
+    squared = functools.reduce(jnp.add, [part**2 for part in blocks])
     others = 1.0 - np.eye(together)[:, :, None]
     norms = safe_sqrt(squared) * (others * active.reshape(active.shape[0], -1, 1, together, active.shape[-1]))
-    total = functools.reduce(jnp.add, [norms[:, :, :, k].reshape(total.shape) for k in range(together)], total)
-    return compute_once(total / RELAXATION, active)
+    total = functools.reduce(jnp.add, [norms[:, :, :, k].reshape(own.shape) for k in range(together)], own)
+    return compute_once(total / TANGENT_RELAXATION, active)
+
+
+def _block(entries: tuple[Entries, Entries], together: int, row: int, column: int) -> Array:
+    """``J_i M^-1 J_j^T`` (turn, manifold, point i, point j, world) of `row` at i to `column` at j."""
+    jacobian, response = entries
+    return point_responses([side[row] for side in jacobian], [side[column] for side in response], together)
 
 
 def _largest_eigenvalue(jacobian: Entries, response: Entries, rows: tuple[int, ...]) -> Array:

@@ -7,6 +7,7 @@ are (row, column, world) or, for a whole table, (turn, row, ...).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -32,6 +33,10 @@ class Bounded:
     lower: Array
     upper: Array
 
+    def relaxed(self, factor: Array) -> Bounded:
+        """The same law, whatever the factor: joints that overshoot were measured to feed a swinging arm with energy."""
+        return self
+
     def update(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
         free = impulse - (error + self.softness * impulse) * self.effective_mass
@@ -54,6 +59,13 @@ class Cone:
     normal_mass: Array
     tangent_mass: Array
     friction: Array
+
+    def relaxed(self, factor: Array) -> Cone:
+        """The same law with longer steps of the normal row, which do not move its fixed point.
+
+        The tangents keep theirs: friction that overshoots while its limit changes was measured to keep bodies creeping.
+        """
+        return dataclasses.replace(self, normal_mass=self.normal_mass * factor)
 
     def update(self, impulse: Array, error: Array) -> Array:
         """Normal row first, then the tangents with the normal's new impulse."""

@@ -38,7 +38,19 @@ from mathota_jax.spatial import counter
 from mathota_jax.spatial.settle import compute_once, store, store_cotangents
 from mathota_jax.spatial.spread import add_slices, spread
 
-Update = Callable[[Any, Array, Array], Array]
+Update = Callable[[Array | int, Any, Array, Array], Array]
+"""New impulses of a turn, from the number of the sweep, coefficients, impulses and errors."""
+
+TurnUpdate = Callable[[Any, Array, Array], Array]
+"""The same within a sweep."""
+
+PLAIN_SWEEPS = 3
+"""Last sweeps, in which contacts do not over-relax: they take to rest what longer steps leave swinging. Measured: with two,
+dropped boxes may creep; with three none of 16 does."""
+
+OVER_RELAXATION = 1.7
+"""Factor on the normal steps of the sweeps before those, which converge if its product with that of `normal_bound` is below
+2. Measured with 10 sweeps from nothing: ten boxes dip by 0.85 mm instead of 2.3."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -62,9 +74,12 @@ def solve(
         return compute_once((velocity, impulses), velocity)
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law for group in rows)
-    return sweeps(
-        iterations, rows, lambda law, impulse, error: law.update(impulse, error), laws, biases, velocity, impulses
-    )
+
+    def update(number: Array | int, law: Law, impulse: Array, error: Array) -> Array:
+        factor = jnp.where(number < iterations - PLAIN_SWEEPS, OVER_RELAXATION, 1.0).astype(error.dtype)
+        return law.relaxed(factor).update(impulse, error)
+
+    return sweeps(iterations, rows, update, laws, biases, velocity, impulses)
 
 
 def sweeps(
@@ -78,11 +93,11 @@ def sweeps(
 ) -> tuple[Array, tuple[Array, ...]]:
     """Plain sweeps, whose derivative is that of every update; `update` gets the coefficients of a group at each turn."""
 
-    def sweep(_: int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+    def sweep(number: Array | int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         velocity, old = carry
-        new = []
+        new, of_turn = [], functools.partial(update, number)
         for group, coefficient, bias, impulse in zip(rows, coefficients, biases, old, strict=True):
-            velocity, impulse = _sweep(group, update, coefficient, bias, velocity, impulse)
+            velocity, impulse = _sweep(group, of_turn, coefficient, bias, velocity, impulse)
             new.append(impulse)
         return velocity, tuple(new)
 
@@ -92,7 +107,7 @@ def sweeps(
 
 
 def _sweep(
-    group: Rows, update: Update, coefficients: object, bias: Array, velocity: Array, impulse: Array
+    group: Rows, update: TurnUpdate, coefficients: object, bias: Array, velocity: Array, impulse: Array
 ) -> tuple[Array, Array]:
     """One pass over the turns of a group."""
     table: Table | TracedTable = group.table
@@ -118,7 +133,9 @@ def _sweep(
     return lax.scan(body, velocity, (indices, jnp.asarray(table.receivers), scanned))
 
 
-def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, impulse: Array) -> tuple[Array, Array]:
+def _sweep_places(
+    group: Rows, update: TurnUpdate, fixed: tuple, velocity: Array, impulse: Array
+) -> tuple[Array, Array]:
     """One pass over those turns of a traced table that hold a constraint."""
     places = group.places
     assert places is not None
@@ -138,7 +155,7 @@ def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, im
 
 
 def _turn(
-    update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
+    update: TurnUpdate, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
 ) -> tuple[Array, Array]:
     """Solves the rows of one turn side by side."""
     matrix, bias, coefficients, impulse = values
@@ -263,7 +280,7 @@ def _linearise(law: Law, impulse: Array, error: Array) -> tuple[Array, Array]:
     return tuple(jnp.stack([column(argument, row) for row in range(row_count)], axis=2) for argument in (0, 1))  # type: ignore[return-value]
 
 
-def _linear_update(coefficients: object, impulse: Array, error: Array) -> Array:
+def _linear_update(_: Array | int, coefficients: object, impulse: Array, error: Array) -> Array:
     by_impulse, by_error, right_side = coefficients  # type: ignore[misc]
     new = right_side if by_error is not None else right_side + error
     for row in range(impulse.shape[0]):

@@ -293,7 +293,7 @@ def _sweep(
     velocity: Array,
     impulses: tuple[Array, ...],
 ) -> tuple[Array, tuple[Array, ...]]:
-    def update(law: Any, impulse: Array, error: Array) -> Array:
+    def update(_: Array | int, law: Any, impulse: Array, error: Array) -> Array:
         return law.update(impulse, error)
 
     return pgs.sweeps(count, rows, update, laws, biases, velocity, impulses)

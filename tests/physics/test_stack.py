@@ -4,8 +4,18 @@ import jax
 import numpy as np
 import pytest
 
-from mathota_jax import Options, contact_forces, contacts
-from tests.scenes import advance, box_stack, motion_and_penetration, record_worlds, repeat
+from mathota_jax import Box, Options, contact_forces, contacts
+from tests.scenes import (
+    advance,
+    advance_worlds,
+    body_on_plane,
+    box_stack,
+    motion_and_penetration,
+    record_worlds,
+    repeat,
+    stack,
+    undamped,
+)
 
 COUNT, DEFAULT_GRAVITY = 10, 9.81
 
@@ -55,3 +65,24 @@ def test_warm_start_is_what_carries_a_tall_stack(float64, warm_start):
     final = advance(model, state, 240)
     sink = float(state.position[-1, 1] - final.position[-1, 1])
     assert (sink < 1e-3) == warm_start
+
+
+def test_dropped_boxes_come_to_rest(precision, gate):
+    """Sweeps that lengthen their steps too far leave boxes creeping at mm/s after they have landed."""
+    orientations = np.random.default_rng(0).normal(size=(16, 4))
+    scenes = [
+        body_on_plane(
+            Box((0.1, 0.1, 0.1)),
+            position=(0, 0.5, 0),
+            orientation=tuple(q / np.linalg.norm(q)),
+            friction=0.4,
+            restitution=0.3,
+            options=undamped(dt=1 / 240),
+        )
+        for q in orientations
+    ]
+    models, states = (stack(part) for part in zip(*scenes, strict=True))
+    after = [advance_worlds(models, states, steps) for steps in (720, 960)]
+    moved = [np.asarray(state.position, dtype=float)[:, 1] for state in after]
+    gate("motion in the fourth second [m]", moved[1] - moved[0], 1e-5)
+    gate("height above the ground [m]", moved[1][:, 1] - 0.1, 1e-4)
