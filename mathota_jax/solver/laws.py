@@ -34,8 +34,12 @@ class Bounded:
     upper: Array
 
     def relaxed(self, factor: Array) -> Bounded:
-        """The same law, whatever the factor: joints that overshoot were measured to feed a swinging arm with energy."""
-        return self
+        """The same law with longer steps of the rows that only push, which do not move its fixed point.
+
+        Joints keep theirs: those that overshoot were measured to feed a swinging arm with energy.
+        """
+        pushes = (self.lower == 0) & (self.upper == jnp.inf)
+        return dataclasses.replace(self, effective_mass=self.effective_mass * jnp.where(pushes, factor, 1.0))
 
     def update(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
