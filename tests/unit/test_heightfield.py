@@ -507,7 +507,9 @@ def test_sphere_rolls_in_a_bowl(gate):
     """The centre comes back to the height it started from, but for what the facets take."""
     points = (np.arange(41) - 20.0) * 0.1
     ground = Heightfield(0.15 * (points[:, None] ** 2 + points**2), 0.1)
-    _, (position, velocity, spin) = simulate(Sphere(0.3), ground, 5.0, position=(1.2, 0.15 * 1.44 + 0.31, 0.05))
+    _, (position, velocity, spin) = simulate(
+        Sphere(0.3), ground, 5.0, position=(1.2, 0.15 * 1.44 + 0.325, 0.05)
+    )  # 3 mm above
     energy = 9.81 * position[:, 1] + 0.5 * (velocity**2).sum(1) + 0.5 * 0.4 * 0.3**2 * (spin**2).sum(1)
     assert position[:, 0].min() < -0.3 and np.abs(position).max() < 1.3
     # Half a step's fall is what the semi-implicit integrator's energy swings by.

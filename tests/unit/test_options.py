@@ -12,7 +12,7 @@ DEFAULTS = {
     "position_iterations": 3,
     "linear_damping": 0.01,
     "angular_damping": 0.05,
-    "slop": 0.0005,
+    "slop": 0.0001,
     "position_percent": 0.8,
     "baumgarte": 0.1,
     "warm_start": True,
