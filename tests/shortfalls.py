@@ -24,6 +24,14 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
     "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
     "positions, whose linear systems the two modes solve by a few sweeps each",
+    "tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[float32-1.0]": "in one of ten "
+    "steps of five bounces the ball ends 12 mm below the plane, gate 1 mm",
+    **{
+        f"tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[{precision}-2.0]": "after three "
+        "exact bounces the rest of a step of 2 s is an ordinary step: in one of ten it ends 0.1 to 0.3 m (before: 0.7 m) above "
+        "the start of 0.5 m, gate 0"
+        for precision in ("float32", "float64")
+    },
     "tests/physics/test_soft_step.py::test_sleep_fast_bodies_and_a_step_of_no_time": "the damping of a whole step is that "
     "of its start: a ball stopped from 180 m/s leaves the wall at 0.022 m/s and is 21 mm away after a second, gate 10 mm",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "

@@ -70,14 +70,16 @@ def test_bounces_at_any_time_step(precision, box, gate):
         assert final.flags == 0
 
 
-def test_more_bounces_than_events_lose_nothing(precision, gate):
+@pytest.mark.parametrize("dt", [0.3, 0.7, 1.0, 2.0])
+def test_more_bounces_than_events_lose_nothing(precision, dt, gate):
     """Up to nine bounces in a step of three events: the ordinary step takes the rest, and nothing passes the plane."""
     model, state = bouncing(None)
-    for dt in (0.3, 0.7, 1.0, 2.0):
-        final = advance(with_dt(model, dt), state, 10)
-        gap = float(final.position[1, 1]) - 0.1
-        gate(f"below the plane, dt {dt} [m]", min(gap, 0.0), 1e-3)
-        gate(f"above the start, dt {dt} [m]", max(gap - DROP, 0.0), 0.0)
+    gaps = []
+    for _ in range(10):
+        state = advance(with_dt(model, dt), state, 1)
+        gaps.append(float(state.position[1, 1]) - 0.1)
+    gate("below the plane [m]", min(*gaps, 0.0), 1e-3)
+    gate("above the start [m]", max(max(gaps) - DROP, 0.0), 0.0)
 
 
 def test_oblique_collision_at_any_time_step(float64, gate):
