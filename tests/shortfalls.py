@@ -32,6 +32,11 @@ SHORTFALLS: dict[str, str] = {
         "0.5 m, gate 0"
         for precision in ("float32", "float64")
     },
+    **{
+        f"tests/physics/test_neutral.py::test_zero_friction_equals_no_friction[{precision}]": "contacts with friction over-relax, "
+        "those without do not: the sweeps part before they have converged"
+        for precision in ("float32", "float64")
+    },
     "tests/physics/test_soft_step.py::test_sleep_fast_bodies_and_a_step_of_no_time": "the damping of a whole step is that "
     "of its start: a ball stopped from 180 m/s leaves the wall at 0.022 m/s and is 21 mm away after a second, gate 10 mm",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "

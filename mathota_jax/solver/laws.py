@@ -34,12 +34,11 @@ class Bounded:
     upper: Array
 
     def relaxed(self, factor: Array) -> Bounded:
-        """The same law with longer steps of the rows that only push, which do not move its fixed point.
+        """The same law, whatever the factor.
 
-        Joints keep theirs: those that overshoot were measured to feed a swinging arm with energy.
+        Joints that overshoot were measured to feed a swinging arm with energy, elastic boxes without friction to spin.
         """
-        pushes = (self.lower == 0) & (self.upper == jnp.inf)
-        return dataclasses.replace(self, effective_mass=self.effective_mass * jnp.where(pushes, factor, 1.0))
+        return self
 
     def update(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
