@@ -24,8 +24,6 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
     "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
     "positions, whose linear systems the two modes solve by a few sweeps each",
-    "tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[float32-1.0]": "in one of ten "
-    "steps of five bounces the ball ends 12 mm below the plane, gate 1 mm",
     **{
         f"tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[{precision}-2.0]": "after three "
         "exact bounces the rest of a step of 2 s is an ordinary step: in one of ten it ends 0.1 to 0.3 m above the start of "
@@ -33,8 +31,8 @@ SHORTFALLS: dict[str, str] = {
         for precision in ("float32", "float64")
     },
     **{
-        f"tests/physics/test_neutral.py::test_zero_friction_equals_no_friction[{precision}]": "contacts with friction over-relax, "
-        "those without do not: the sweeps part before they have converged"
+        f"tests/physics/test_neutral.py::test_zero_friction_equals_no_friction[{precision}]": "contacts with friction "
+        "over-relax, those without do not: the sweeps part before they have converged"
         for precision in ("float32", "float64")
     },
     "tests/physics/test_soft_step.py::test_sleep_fast_bodies_and_a_step_of_no_time": "the damping of a whole step is that "
