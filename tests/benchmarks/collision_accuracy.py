@@ -7,40 +7,29 @@ Writes ``results/collision_accuracy.json`` and ``.md``; what earlier runs found 
 
 from __future__ import annotations
 
-import argparse
-import json
-import pathlib
-
 import jax
 import numpy as np
 
+from tests.benchmarks.pair_report import run
 from tests.benchmarks.pose_sweep import GATES, gate, kinds_of_pose, measure, sweep
 from tests.convex_oracle import PAIRS
 
-RESULTS = pathlib.Path(__file__).parent / "results"
 PRECISIONS = ("float32", "float64")
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the sweep and writes both files."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.collision_accuracy", description=__doc__)
-    parser.add_argument("count", nargs="?", type=int, default=30, help="poses of each kind")
-    parser.add_argument("--pairs", help="names such as box_cone, separated by commas; default all")
-    options = parser.parse_args(arguments)
-    names = None if options.pairs is None else options.pairs.split(",")
-    pairs = [pair for pair in PAIRS if names is None or "_".join(pair) in names]
-    RESULTS.mkdir(exist_ok=True)
-    stored = RESULTS / "collision_accuracy.json"
-    rows = json.loads(stored.read_text())["rows"] if stored.exists() else []
-    for pair in pairs:
-        found = []
-        for precision in PRECISIONS:
-            with jax.enable_x64(precision == "float64"):
-                found += [row(pair, kind, options.count, precision) for kind in kinds_of_pose()]
-                jax.clear_caches()
-        rows = [known for known in rows if known["pair"] != "_".join(pair)] + found
-        stored.write_text(json.dumps({"rows": rows}, indent=0) + "\n")
-        (RESULTS / "collision_accuracy.md").write_text(table(rows))
+    run("collision_accuracy", __doc__, (30, "poses of each kind"), PAIRS, in_each_precision, table, arguments)
+
+
+def in_each_precision(pair: tuple[str, str], count: int) -> list[dict]:
+    """Rows of a pair."""
+    found = []
+    for precision in PRECISIONS:
+        with jax.enable_x64(precision == "float64"):
+            found += [row(pair, kind, count, precision) for kind in kinds_of_pose()]
+            jax.clear_caches()
+    return found
 
 
 def row(pair: tuple[str, str], kind: str, count: int, precision: str) -> dict:

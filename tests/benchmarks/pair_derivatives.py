@@ -9,11 +9,8 @@ feature changes within the difference, and the pose is left out for that paramet
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
-import json
-import pathlib
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -28,8 +25,8 @@ from mathota_jax import Box, Capsule, Cone, Cylinder, Geometry, Heightfield, Pla
 from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.geometry import SHAPES
+from tests.benchmarks.pair_report import run
 
-RESULTS = pathlib.Path(__file__).parent / "results"
 GATE = 1e-6
 STEPS = (4e-3, 1e-3, 2.5e-4)
 """Step lengths [m, rad] of the central differences; shapes are half a metre in size."""
@@ -159,26 +156,16 @@ def measure(pair: tuple[str, str], count: int) -> list[dict]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Measures the chosen pairs and writes both files."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.pair_derivatives", description=__doc__)
-    parser.add_argument("count", nargs="?", type=int, default=24, help="poses of each pair")
-    parser.add_argument("--pairs", help="names such as box_cone, separated by commas; default all")
-    options = parser.parse_args(arguments)
-    names = None if options.pairs is None else options.pairs.split(",")
-    RESULTS.mkdir(exist_ok=True)
-    stored = RESULTS / "pair_derivatives.json"
-    rows = json.loads(stored.read_text())["rows"] if stored.exists() else []
-    order = {"_".join(pair): place for place, pair in enumerate(PAIRS)}
-    for pair in PAIRS:
-        if names is not None and "_".join(pair) not in names:
-            continue
-        with jax.enable_x64(True):
-            found = measure(pair, options.count)
-            jax.clear_caches()
-        rows = [known for known in rows if known["pair"] != "_".join(pair)] + found
-        rows.sort(key=lambda row: order[row["pair"]])
-        stored.write_text(json.dumps({"rows": rows}, indent=0) + "\n")
-        (RESULTS / "pair_derivatives.md").write_text(table(rows))
-        print(pair, max(max(row[name] for name in OUTPUTS) for row in found), flush=True)
+    run("pair_derivatives", __doc__, (24, "poses of each pair"), PAIRS, in_float64, table, arguments)
+
+
+def in_float64(pair: tuple[str, str], count: int) -> list[dict]:
+    """Rows of a pair, the worst of which is printed."""
+    with jax.enable_x64(True):
+        found = measure(pair, count)
+        jax.clear_caches()
+    print(pair, max(max(row[name] for name in OUTPUTS) for row in found), flush=True)
+    return found
 
 
 def table(rows: list[dict]) -> str:

@@ -7,21 +7,18 @@ Writes ``results/pose_classes.json`` and ``.md``; what earlier runs found for ot
 
 from __future__ import annotations
 
-import argparse
-import json
-import pathlib
 from typing import Any
 
 import jax
 import numpy as np
 
+from tests.benchmarks.pair_report import run
 from tests.benchmarks.pose_sweep import GATES
 from tests.convex_oracle import Result, random_scene, rounded
 from tests.polytope_oracle import placed, polytope_distance, polytope_pairs, separations
 from tests.round_oracle import KINDS as ROUND
 from tests.round_oracle import round_distance
 
-RESULTS = pathlib.Path(__file__).parent / "results"
 CLASSES = {"separated": (1e-2, 1.0), "touching": (-1e-4, 1e-4), "shallow": (-1e-2, -1e-4), "deep": (0.0, 0.0)}
 """Separation [size], uniform between these; deep poses stay where they are drawn."""
 DEEP_REACH = 0.5
@@ -30,31 +27,24 @@ DEEP_REACH = 0.5
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the sweep and writes both files."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.pose_classes", description=__doc__)
-    parser.add_argument("count", nargs="?", type=int, default=20000, help="poses of each pair in each precision")
-    parser.add_argument("--pairs", help="names such as box_polyhedron, separated by commas; default all")
-    options = parser.parse_args(arguments)
-    names = None if options.pairs is None else options.pairs.split(",")
-    stored = RESULTS / "pose_classes.json"
-    rows = json.loads(stored.read_text())["rows"] if stored.exists() else []
-    for pair in polytope_pairs():
-        if names is not None and "_".join(pair) not in names:
-            continue
-        scene, kinds, sizes = draw(pair, options.count)
-        found = []
-        for precision in ("float32", "float64"):
-            with jax.enable_x64(precision == "float64"):
-                found += measure(pair, scene, kinds, sizes, precision)
-                jax.clear_caches()
-        rows = [row for row in rows if row["pair"] != "_".join(pair)] + found
-        stored.write_text(json.dumps({"rows": rows}, indent=0) + "\n")
-        (RESULTS / "pose_classes.md").write_text(table(rows))
+    meaning = "poses of each pair in each precision"
+    run("pose_classes", __doc__, (20000, meaning), polytope_pairs(), in_each_precision, table, arguments)
+
+
+def in_each_precision(pair: tuple[str, str], count: int) -> list[dict]:
+    """Rows of a pair: the same poses in both precisions."""
+    scene, kinds, sizes = draw(pair, count)
+    found = []
+    for precision in ("float32", "float64"):
+        with jax.enable_x64(precision == "float64"):
+            found += measure(pair, scene, kinds, sizes, precision)
+            jax.clear_caches()
+    return found
 
 
 def exact(pair: tuple[str, str], scene: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances [m] and normals: in closed form where there is one."""
-    truths, normals = (round_distance if set(pair) <= set(ROUND) else polytope_distance)(pair, scene)
-    return truths, normals
+    return (round_distance if set(pair) <= set(ROUND) else polytope_distance)(pair, scene)
 
 
 def draw(pair: tuple[str, str], count: int) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
