@@ -27,11 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
+from jax.extend.core import Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-Native = Callable[..., list[Array]]
-"""Flat function of arrays with one trailing world axis each (of common size, or 1), hashable."""
+Native = Callable[..., Any]
+"""Function of arrays with one trailing world axis each (of common size, or 1) to a pytree of such, hashable."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,32 +69,27 @@ def batch_last(function: Callable[..., Any], shortcut: Shortcut | None = None) -
         leaves = [jnp.asarray(leaf) for leaf in leaves]
         native = TreeFunction(function, in_tree, shortcut)
         out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
-        return jax.tree.unflatten(_out_tree(native, tuple(_signature(leaf) for leaf in leaves)), out_leaves)
+        return jax.tree.unflatten(_out_tree(native, _natural_signatures(leaves, 0)), out_leaves)
 
     return natural
 
 
 @dataclasses.dataclass(frozen=True)
 class TreeFunction:
-    """Flat native form of a function of pytrees."""
+    """A function of pytrees as one of their leaves."""
 
     function: Callable[..., Any]
     in_tree: Any
     shortcut: Shortcut | None = None
 
-    def __call__(self, *leaves: Array) -> list[Array]:
-        return jax.tree.leaves(self.function(*jax.tree.unflatten(self.in_tree, leaves)))
+    def __call__(self, *leaves: Array) -> Any:
+        return self.function(*jax.tree.unflatten(self.in_tree, leaves))
 
     def again(self, shortcut: Shortcut, result: Any, leaves: Sequence[Array]) -> tuple[TreeFunction, list[Array]]:
         """The function by its shortcut, and the arrays that it needs before the arguments."""
         args = jax.tree.unflatten(self.in_tree, leaves)
         kept = shortcut.keep(result, *args)
         return TreeFunction(shortcut.function, jax.tree.structure((kept, *args))), jax.tree.leaves(kept)
-
-    def out_tree(self, shapes: Sequence[jax.ShapeDtypeStruct]) -> Any:
-        """Structure of the result for arguments of the given shapes."""
-        result = jax.eval_shape(lambda *leaves: self.function(*jax.tree.unflatten(self.in_tree, leaves)), *shapes)
-        return jax.tree.structure(result)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +140,7 @@ def _restricted(native: Native, primals: list[Array], mask: tuple[bool, ...]) ->
     def function(*linear: Array) -> list[Array]:
         replacements = iter(linear)
         args = [next(replacements) if selected else primal for primal, selected in zip(primals, mask, strict=True)]
-        return [output for output in _traced(native)(*args) if _is_real(output)]
+        return [output for output in _run(native, args) if _is_real(output)]
 
     return function
 
@@ -154,16 +149,54 @@ def _is_real(value: Any) -> bool:
     return jnp.issubdtype(value.dtype, jnp.inexact)
 
 
+Signature = tuple[tuple[int, ...], Any]
+
+
+def _run(native: Native, args: Sequence[Array]) -> list[Array]:
+    """The leaves of the result; shape inference, lowering and derivatives share one trace of the function."""
+    signatures = tuple((arg.shape, arg.dtype) for arg in args)
+    return _traced(native, signatures, _trace_context())(*args)
+
+
 @functools.lru_cache(maxsize=512)
-def _traced(native: Native) -> Callable[..., list[Array]]:
-    """`native` behind `jit`, for its cache of traces only: shape inference, lowering and derivatives share one trace."""
-    return jax.jit(lambda *args: native(*args))
+def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[Any, ...]) -> Callable[..., list[Array]]:
+    """`native` as a program for arguments of the given shapes and types.
+
+    The cache of `jit` does not serve: it forgets between a trace and its lowering, whose contexts differ.
+    """
+    del context
+    shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in signatures]
+    # Behind `jit`, so that whoever calls the program binds one equation instead of each.
+    program, result = jax.make_jaxpr(jax.jit(lambda *args: native(*args)), return_shape=True)(*shapes)
+    _known_out_tree(native, tuple((shape[:-1], dtype) for shape, dtype in signatures))[:] = [jax.tree.structure(result)]
+    return jaxpr_as_fun(program)
+
+
+def _trace_context() -> tuple[Any, ...]:
+    """Settings of JAX on which the program of a function depends."""
+    return jax.config.read("jax_enable_x64"), jax.config.read("jax_default_matmul_precision")
+
+
+@functools.lru_cache(maxsize=1024)
+def _known_out_tree(native: Native, natural: tuple[Signature, ...]) -> list[Any]:
+    """Where the structure of the result is kept, once it has been seen for any number of worlds."""
+    del native, natural
+    return []
+
+
+def _out_tree(native: Native, natural: tuple[Signature, ...]) -> Any:
+    """Structure of the result for arguments of the given shapes without the world axis."""
+    known = _known_out_tree(native, natural)
+    if not known:
+        one_world = tuple(((*shape, 1), dtype) for shape, dtype in natural)
+        _traced(native, one_world, _trace_context())
+    return known[0]
 
 
 def _evaluate(*args: Array, native: Native, world_axes: int) -> list[Array]:
     """Calls `native` on arrays with any number of trailing world axes, merging them into one."""
     worlds = np.broadcast_shapes(*(arg.shape[arg.ndim - world_axes :] for arg in args)) if world_axes else ()
-    outputs = _traced(native)(*(_merge_worlds(arg, worlds) for arg in args))
+    outputs = _run(native, [_merge_worlds(arg, worlds) for arg in args])
     shapes = (output.shape[:-1] for output in outputs)
     return [
         jnp.broadcast_to(output, (*shape, math.prod(worlds))).reshape(*shape, *worlds)
@@ -178,36 +211,14 @@ def _merge_worlds(arg: Array, worlds: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(arg, (*natural, *worlds)).reshape(*natural, math.prod(worlds))
 
 
-Signature = tuple[tuple[int, ...], Any]
-
-
-def _signature(value: Any) -> Signature:
-    return value.shape, value.dtype
-
-
 def _natural_signatures(avals: Sequence[Any], world_axes: int) -> tuple[Signature, ...]:
     return tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in avals)
 
 
-def _one_world(signatures: tuple[Signature, ...]) -> list[jax.ShapeDtypeStruct]:
-    return [jax.ShapeDtypeStruct((*shape, 1), dtype) for shape, dtype in signatures]
-
-
-@functools.lru_cache(maxsize=1024)
-def _out_tree(native: TreeFunction, signatures: tuple[Signature, ...]) -> Any:
-    return native.out_tree(_one_world(signatures))
-
-
-@functools.lru_cache(maxsize=1024)
-def _natural_outputs(native: Native, signatures: tuple[Signature, ...]) -> tuple[Signature, ...]:
-    outputs = jax.eval_shape(_traced(native), *_one_world(signatures))
-    return tuple((output.shape[:-1], output.dtype) for output in outputs)
-
-
 def _abstract_evaluation(*avals: Any, native: Native, world_axes: int) -> list[Any]:
-    worlds = np.broadcast_shapes(*(a.shape[a.ndim - world_axes :] for a in avals)) if world_axes else ()
-    outputs = _natural_outputs(native, _natural_signatures(avals, world_axes))
-    return [ShapedArray((*shape, *worlds), dtype) for shape, dtype in outputs]
+    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
+    outputs = jax.eval_shape(functools.partial(_evaluate, native=native, world_axes=world_axes), *shapes)
+    return [ShapedArray(output.shape, output.dtype) for output in outputs]
 
 
 @functools.lru_cache(maxsize=512)
