@@ -174,7 +174,7 @@ def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[An
 
 def _trace_context() -> tuple[Any, ...]:
     """Settings of JAX on which the program of a function depends."""
-    return jax.config.read("jax_enable_x64"), jax.config.read("jax_default_matmul_precision")
+    return jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @functools.lru_cache(maxsize=1024)
