@@ -212,6 +212,32 @@ def test_empty_tree_and_empty_batch(float64):
     np.testing.assert_array_equal(wrapped(jnp.zeros(3), {}), np.ones(3))
 
 
+@pytest.mark.parametrize(
+    ("program", "traces"),
+    [(lambda f: jax.vmap(f), 1), (lambda f: jax.grad(lambda x: jnp.sum(jax.vmap(f)(x) ** 2)), 1)],
+    ids=["value", "gradient"],
+)
+def test_one_trace_serves_shapes_lowering_and_derivatives(program, traces):
+    count = 0
+
+    def function(x):
+        nonlocal count
+        count += 1
+        return {"result": jnp.sin(x)}
+
+    jax.jit(program(lambda x: batch_last(function)(x)["result"])).lower(jnp.ones(3)).compile()
+    assert count == traces
+
+
+def test_another_precision_is_another_trace():
+    wrapped = batch_last(lambda x: (x * 2, jnp.arange(3)[:, None] + jnp.zeros(x.shape[-1:], int)))
+    x = np.ones(3, np.float32)
+    for wide, expected in ((False, "int32"), (True, "int64"), (False, "int32")):
+        with jax.enable_x64(wide):
+            value, numbers = jax.vmap(wrapped)(x)
+            assert value.dtype == "float32" and numbers.dtype == expected
+
+
 def test_one_trace_serves_many_calls():
     count = 0
 
