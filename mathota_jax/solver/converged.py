@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +32,8 @@ from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
 from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_all_slices, add_slices, largest_slice
 
 LIMIT = 150
 """Largest number of linear systems in a solve. Measured: ten boxes at rest take 1 or 2, a falling pile 20."""
@@ -157,7 +160,7 @@ class _Problem:
             dataclasses.replace(group, matrix=Dense(tuple(jnp.abs(j) for j in group.jacobian), group.response))
             for group in rows
         ]
-        speed = _largest(r * row_velocity(s, jnp.abs(free)) for r, s in zip(self.root, size, strict=True))
+        speed = _largest((r * row_velocity(s, jnp.abs(free)) for r, s in zip(self.root, size, strict=True)), free)
         none = tuple(jnp.zeros_like(group.bias) for group in rows)
         scale = speed + self.residual(none, self.errors(free))
         self.tolerance = TOLERANCE[str(free.dtype)] * scale
@@ -165,21 +168,23 @@ class _Problem:
 
     def errors(self, velocity: Array) -> Impulses:
         """Constraint errors of all rows."""
-        return tuple(group.bias + row_velocity(group, velocity) for group in self.rows)
+        return compute_once(tuple(group.bias + row_velocity(group, velocity) for group in self.rows), self.free)
 
     def residual(self, impulses: Impulses, errors: Impulses) -> Array:
         """Largest distance (world,) of impulses from those that the laws ask for."""
-        return _largest(
+        parts = tuple(
             safe_divide(jnp.abs(old - group.law.update(old, error)), jnp.broadcast_to(root, old.shape))
             for group, old, error, root in zip(self.rows, impulses, errors, self.root, strict=True)
         )
+        return _largest(parts, self.free)
 
     def project(self, stiffness: Array, centre: Impulses, errors: Impulses) -> Impulses:
         """Impulses of the stiffened laws."""
-        return tuple(
+        impulses = tuple(
             stiffen(group.law, stiffness).update(old, error)
             for group, old, error in zip(self.rows, centre, errors, strict=True)
         )
+        return compute_once(impulses, self.free)
 
     def iterate(self, search: _Search) -> _Search:
         """One Newton step; where that has solved the inner problem, the outer step as well."""
@@ -189,12 +194,13 @@ class _Problem:
             slope(stiffen(group.law, search.stiffness), old, error)
             for group, old, error in zip(self.rows, search.centre, errors, strict=True)
         )
+        slopes = compute_once(slopes, self.free)
         change, energy = self.mismatch(search.trial, impulses)
-        factor = velocity_system.factorize(self.rows, slopes, self.free.shape[0])
-        direction = -velocity_system.solve(factor, change)
+        direction = -velocity_system.solve_once(self.rows, slopes, change)
         found = self.line_search(search, errors, impulses, slopes, direction, energy)
 
-        inner = _largest(r * jnp.abs(row_velocity(g, found.change)) for r, g in zip(self.root, self.rows, strict=True))
+        mismatch = (r * jnp.abs(row_velocity(g, found.change)) for r, g in zip(self.root, self.rows, strict=True))
+        inner = _largest(mismatch, self.free)
         residual = jnp.maximum(inner, self.residual(found.impulses, found.error))
         gives_up = search.newton >= NEWTON_LIMIT
         outer = gives_up | (inner <= INEXACT * search.residual) | (inner <= self.tolerance)
@@ -225,12 +231,12 @@ class _Problem:
     def mismatch(self, trial: Impulses, impulses: Impulses) -> tuple[Array, Array]:
         """Velocity change from the one impulses to the others, and its kinetic energy, times 2."""
         difference = tuple(a - b for a, b in zip(trial, impulses, strict=True))
-        change = add_impulses(self.rows, jnp.zeros_like(self.free), difference)
+        change = compute_once(add_impulses(self.rows, jnp.zeros_like(self.free), difference), self.free)
         energy = [
-            (part * row_velocity(group, change)).sum((0, 1, 2))
+            add_all_slices(part * row_velocity(group, change))
             for part, group in zip(difference, self.rows, strict=True)
         ]
-        return change, functools.reduce(jnp.add, energy)
+        return change, compute_once(functools.reduce(jnp.add, energy), self.free)
 
     def line_search(
         self,
@@ -242,11 +248,12 @@ class _Problem:
         energy: Array,
     ) -> _Trial:
         """Halves the Newton step until the residual falls; the best of all trials if it does not."""
-        rates = tuple(row_velocity(group, direction) for group in self.rows)
+        rates = compute_once(tuple(row_velocity(group, direction) for group in self.rows), self.free)
         toward = tuple(
-            part - old + (matrix * rate[:, None]).sum(2)
+            part - old + add_slices(matrix * rate[:, None], 2)
             for part, old, matrix, rate in zip(impulses, search.trial, slopes, rates, strict=True)
         )
+        toward = compute_once(toward, self.free)
 
         def at(step: Array) -> _Trial:
             trial = tuple(old + step * change for old, change in zip(search.trial, toward, strict=True))
@@ -273,9 +280,9 @@ def _where(condition: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
-def _largest(values: object) -> Array:
+def _largest(values: Iterable[Array], like: Array) -> Array:
     """Maximum over rows, (world,)."""
-    return functools.reduce(jnp.maximum, [value.max((0, 1, 2)) for value in values])  # type: ignore[attr-defined]
+    return compute_once(functools.reduce(jnp.maximum, [largest_slice(value) for value in values]), like)
 
 
 @solve.defjvp

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver.rows import Rows
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_slices
 
 
 class Factor(NamedTuple):
@@ -23,31 +25,55 @@ class Factor(NamedTuple):
     permutation: Array
 
 
+def solve_once(rows: tuple[Rows, ...], by_error: tuple[Array, ...], right_side: Array) -> Array:
+    """``G^-1`` times (component, block, world); `by_error` is (turn, row, row', column, world) for each group.
+
+    The right side is one more column of the matrix, which elimination permutes and reduces with the others: to turn pivots
+    into a permutation takes longer than to eliminate.
+    """
+    columns = [_system(rows, by_error, right_side.shape[0]), _vectors(right_side)]
+    lu = lax.linalg.lu(jnp.concatenate(columns, axis=2))[0]
+    return _velocity(lax.linalg.triangular_solve(lu[..., :-1], lu[..., -1:], left_side=True, lower=False), right_side)
+
+
 def factorize(rows: tuple[Rows, ...], by_error: tuple[Array, ...], components: int) -> Factor:
-    """Factors of ``G``; `by_error` is (turn, row, row', column, world) for each group."""
-    count = rows[0].table.block_count
-    worlds = max(value.shape[-1] for value in by_error)
-    total = jnp.zeros((count * count, components, components, worlds), by_error[0].dtype)
-    for group, matrix in zip(rows, by_error, strict=True):
-        blocks = _blocks(group)
-        weighted = [_weigh(matrix, jacobian) for jacobian in group.jacobian]
-        for receiver, response in zip(blocks, group.response, strict=True):
-            for source, jacobian in zip(blocks, weighted, strict=True):
-                total = _scatter(group, total, receiver, source, response, jacobian)
-    system = total.reshape(count, count, components, components, worlds).transpose(4, 0, 2, 1, 3)
-    size = count * components
-    lu, _, permutation = lax.linalg.lu(jnp.eye(size, dtype=total.dtype) - system.reshape(worlds, size, size))
+    """Factors of ``G`` for many right sides."""
+    lu, _, permutation = lax.linalg.lu(_system(rows, by_error, components))
     return Factor(lu, permutation)
 
 
 def solve(factor: Factor, right_side: Array) -> Array:
     """``G^-1`` times (component, block, world); linear in it and transposable."""
-    components, count, worlds = right_side.shape
-    vector = right_side.transpose(2, 1, 0).reshape(worlds, count * components)
-    vector = jnp.take_along_axis(vector, factor.permutation, axis=1)[..., None]
+    vectors = jnp.take_along_axis(_vectors(right_side), factor.permutation[..., None], axis=1)
     lower = functools.partial(lax.linalg.triangular_solve, left_side=True, lower=True, unit_diagonal=True)
-    vector = lax.linalg.triangular_solve(factor.lu, lower(factor.lu, vector), left_side=True, lower=False)
-    return vector.reshape(worlds, count, components).transpose(2, 1, 0)
+    vectors = lax.linalg.triangular_solve(factor.lu, lower(factor.lu, vectors), left_side=True, lower=False)
+    return _velocity(vectors, right_side)
+
+
+def _vectors(velocity: Array) -> Array:
+    """(world, n, 1) of (component, block, world)."""
+    return velocity.transpose(2, 1, 0).reshape(velocity.shape[-1], -1, 1)
+
+
+def _velocity(vectors: Array, like: Array) -> Array:
+    """(component, block, world) of (world, n, 1)."""
+    return vectors.reshape(-1, like.shape[1], like.shape[0]).transpose(2, 1, 0)
+
+
+def _system(rows: tuple[Rows, ...], by_error: tuple[Array, ...], components: int) -> Array:
+    """``G``, (world, n, n)."""
+    count = rows[0].table.block_count
+    worlds = max(value.shape[-1] for value in by_error)
+    total = jnp.zeros((count * count, components, components, worlds), by_error[0].dtype)
+    for group, matrix in zip(rows, by_error, strict=True):
+        blocks = _blocks(group)
+        weighted = compute_once([_weigh(matrix, jacobian) for jacobian in group.jacobian], matrix)
+        for receiver, response in zip(blocks, group.response, strict=True):
+            for source, jacobian in zip(blocks, weighted, strict=True):
+                total = _scatter(group, total, receiver, source, response, jacobian)
+    system = total.reshape(count, count, components, components, worlds).transpose(4, 0, 2, 1, 3)
+    size = count * components
+    return jnp.eye(size, dtype=total.dtype) - system.reshape(worlds, size, size)
 
 
 def _blocks(group: Rows) -> tuple[Any, ...]:
@@ -70,8 +96,8 @@ def _scatter(group: Rows, total: Array, receiver: Array, source: Array, response
         jnp.add, [response[:, row, :, None] * jacobian[:, row, None] for row in range(jacobian.shape[1])]
     )  # (turn, component, component', column, world)
     turns, components = product.shape[:2]
-    product = product.reshape(turns, components, components, -1, together, product.shape[-1]).sum(4)
-    product = jnp.moveaxis(product, 3, 1)
+    product = compute_once(product.reshape(turns, components, components, -1, together, product.shape[-1]), product)
+    product = jnp.moveaxis(add_slices(product, 4), 3, 1)
     index = jnp.where((receiver < count) & (source < count), receiver * count + source, count * count)
     product = product.reshape(-1, *product.shape[2:])
     if group.places is None:

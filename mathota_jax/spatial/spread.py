@@ -1,4 +1,4 @@
-"""`spread` and `add_slices`: a broadcast and a sum along short axes, each the transpose of the other.
+"""`spread` and `add_slices`: a broadcast and a sum along short axes, each the transpose of the other; `largest_slice`.
 
 The transpose of an ordinary broadcast is a reduction, which XLA on CPUs computes by a library call or a scalar loop: for
 the few rows and components of a constraint that takes longer than everything around it. A sum of slices is fused with
@@ -18,6 +18,11 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from mathota_jax.spatial.indexing import unstack
+
+FEW_SLICES = 64
+"""Beyond, a loop of the library costs less than the code of as many terms takes to compile."""
+
 
 def spread(array: Array, shape: tuple[int, ...]) -> Array:
     """Repeats an array along its axes of size 1; the last axis, that of the worlds, is left as it is.
@@ -35,6 +40,18 @@ def add_slices(array: Array, axis: int) -> Array:
     axis %= array.ndim
     total = array if array.shape[axis] == 1 else _add_slices_p.bind(array, axis=axis)
     return jnp.squeeze(total, axis)
+
+
+def add_all_slices(array: Array) -> Array:
+    """Sum (world,) along all axes but the last."""
+    slices = array.reshape(-1, array.shape[-1])
+    return add_slices(slices, 0) if len(slices) <= FEW_SLICES else slices.sum(0)
+
+
+def largest_slice(array: Array) -> Array:
+    """Maximum (world,) along all axes but the last."""
+    slices = array.reshape(-1, array.shape[-1])
+    return functools.reduce(jnp.maximum, unstack(slices, 0)) if len(slices) <= FEW_SLICES else slices.max(0)
 
 
 def _broadcast(array: Array, *, shape: tuple[int, ...]) -> Array:
