@@ -7,7 +7,7 @@ from mathota_jax.collision.convex.polytope import are_polytopes
 from mathota_jax.collision.manifold import Manifold, Nearest
 from mathota_jax.collision.pairs.box_box import box_box
 from mathota_jax.collision.pairs.capsule_box import capsule_box
-from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule
+from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule, capsule_distance
 from mathota_jax.collision.pairs.convex import convex_pair, convex_point_count
 from mathota_jax.collision.pairs.convex_heightfield import HEIGHTFIELD_POINTS, heightfield_pair
 from mathota_jax.collision.pairs.convex_heightfield import KINDS as HEIGHTFIELD_KINDS
@@ -84,7 +84,7 @@ PAIRS: dict[tuple[str, str], Pair] = {
     ("sphere", "cylinder"): Pair(sphere_cylinder, 1),
     ("sphere", "cone"): Pair(sphere_cone, 1),
     ("sphere", "polyhedron"): Pair(sphere_polyhedron, 1),
-    ("capsule", "capsule"): Pair(capsule_capsule, 2),
+    ("capsule", "capsule"): Pair(capsule_capsule, 2, CLOSED_FORM, capsule_distance),
     ("capsule", "box"): Pair(capsule_box, 2),
     ("box", "box"): Pair(box_box, 4, SEPARATING_AXES, box_distance),
 }
