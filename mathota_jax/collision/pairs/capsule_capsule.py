@@ -10,8 +10,8 @@ from mathota_jax.collision.closest import clamp, closest_parameters, direction, 
 from mathota_jax.collision.manifold import Manifold, Nearest
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import settle_code, store_cotangents
-from mathota_jax.spatial.vector import Vec3, cross, dot
+from mathota_jax.spatial.settle import settle, settle_code, store_cotangents
+from mathota_jax.spatial.vector import Vec3, cross, dot, where
 
 PARALLEL_SINE = 0.02
 """Below this sine of the angle between the axes the capsules touch along a line: two contacts."""
@@ -35,7 +35,8 @@ def capsule_capsule(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: 
     across = cross(axis_a, axis_b).map(store_cotangents)
     fallback = direction(across, perpendicular(axis_a).map(store_cotangents), 1.0)
     difference = (offset + axis_b * t_b - axis_a * t_a).map(store_cotangents)
-    normal = direction(difference, fallback, radius_a + radius_b)
+    inner = (jnp.abs(t_a) < length_a) & (jnp.abs(t_b) < length_b)
+    normal = _normal(difference, across, fallback, inner, radius_a + radius_b)
 
     # The overlap on A's axis: both shadows are intervals, each bound carries the end it comes from.
     cosine = dot(axis_a, axis_b)
@@ -76,8 +77,10 @@ def capsule_distance(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b:
     offset = pose_b.position - pose_a.position
     t_a, t_b = closest_parameters(offset, axis_a, axis_b, a["half_height"], b["half_height"])
     core_a, core_b = axis_a * t_a, axis_b * t_b
-    fallback = direction(cross(axis_a, axis_b), perpendicular(axis_a), 1.0)
-    normal = direction(offset + core_b - core_a, fallback, a["radius"] + b["radius"])
+    across = cross(axis_a, axis_b)
+    fallback = direction(across, perpendicular(axis_a), 1.0)
+    inner = (jnp.abs(t_a) < a["half_height"]) & (jnp.abs(t_b) < b["half_height"])
+    normal = _normal(offset + core_b - core_a, across, fallback, inner, a["radius"] + b["radius"])
     shares = tuple(safe_divide(t, shape["half_height"]) for t, shape in ((t_a, a), (t_b, b)))
     gap = _gap((normal, *shares), (offset, axis_a, axis_b, a["half_height"], b["half_height"]))
     return Nearest(
@@ -86,6 +89,17 @@ def capsule_distance(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b:
         pose_a.position + core_a + normal * a["radius"],
         pose_b.position + core_b - normal * b["radius"],
     )
+
+
+def _normal(difference: Vec3, across: Vec3, fallback: Vec3, inner: Array, size: Any) -> Vec3:
+    """Unit direction between the closest points, or across both axes where these all but meet inside of both.
+
+    There the two are the same, but round-off turns the difference the more the shorter it is.
+    """
+    squared, product = dot(difference, difference), dot(difference, across)
+    meet = inner & (squared < size * size * dot(across, across))
+    turn = settle(jnp.where(meet, jnp.where(product < 0, -1.0, 1.0), 0.0).astype(squared.dtype))
+    return where(turn != 0, fallback * turn, direction(difference, fallback, size))
 
 
 @jax.custom_jvp
