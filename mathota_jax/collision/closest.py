@@ -65,11 +65,6 @@ def round_point(
     )
 
 
-def closest_on_segment(point: Vec3, center: Vec3, axis: Vec3, half_length: Any) -> Vec3:
-    """Point of the segment ``center + t * axis``, ``|t| <= half_length`` (unit axis), that is closest to `point`."""
-    return center + axis * clamp(dot(axis, point - center), -half_length, half_length)
-
-
 def closest_parameters(
     offset: Vec3, axis_a: Vec3, axis_b: Vec3, half_length_a: Any, half_length_b: Any
 ) -> tuple[Array, Array]:

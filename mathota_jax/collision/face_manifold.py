@@ -125,7 +125,8 @@ def face_manifold(
     size = jnp.minimum(_extent(frozen[0]), _extent(frozen[1]))
     slots = point_count(kind_a, kind_b)
     code, use_witness = _search(*frozen, *outlines, lax.stop_gradient(contact.separation), size, facing, slots)
-    middle, gap, meeting = _points(reference, incident, normal, *outlines, code, size, facing)
+    least = lax.stop_gradient(contact.separation)
+    middle, gap, meeting = _points(reference, incident, normal, *outlines, code, least, size, facing)
     feature = _feature_ids(meeting, corner_count(kind_a, a), corner_count(kind_b, b), swap)
 
     witness = (contact.point_a + contact.point_b) * 0.5 - origin
@@ -322,12 +323,16 @@ def _points(
     reference_outline: _Outline,
     incident_outline: _Outline,
     code: Array,
+    least: Array,
     size: Array,
     facing: float,
 ) -> tuple[Vec3, Array, _Meeting]:
     """Points midway between the faces, their gaps along the normal and what meets in each; (slot, pair, world).
 
     Differentiable but for the codes.
+
+    The corners of a steep face lie as far beside the widened reference as it is widened, and a multiple of that above or
+    below its plane: `least`, the exact separation, bounds the gaps and is that of the first point.
     """
     number = normal.x.dtype
     count = incident.corners.x.shape[0]
@@ -357,7 +362,10 @@ def _points(
     on_incident = start + (end - start) * compute_once(jnp.where(crossed, share, 0.0), normal.x)
     point = where(at_corner, corner, on_incident)
     height = jnp.where(at_corner, _height(incident, corner, normal), _height(reference, on_incident, normal))
-    height = compute_once(height, normal.x)
+    first = jnp.arange(code.shape[0])[:, None, None] == 0
+    excess = lax.stop_gradient(height) - least
+    wrong = (excess < 0) | (first & (excess > depth_tolerance(number) * size))
+    height = compute_once(height - jnp.where(wrong, excess, 0.0), normal.x)
     # From a point on A the gap leads along the normal, from a point on B against it.
     middle = point + normal * (jnp.where(at_corner, 0.5 * facing, -0.5 * facing).astype(number) * height)
     return middle, height, _Meeting(at_corner, crossed, id_start, id_end, id_side, id_next)

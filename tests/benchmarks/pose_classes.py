@@ -1,4 +1,4 @@
-"""The convex distance in many random poses, separated to deep, against every direction that can separate (float64).
+"""Signed distances of every pair in many random poses, separated to deep, against all directions that can separate.
 
     python -m tests.benchmarks.pose_classes [poses per pair] [--pairs box_polyhedron,...]
 
@@ -7,15 +7,22 @@ Writes ``results/pose_classes.json`` and ``.md``; what earlier runs found for ot
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from mathota_jax import Box, Capsule, Cone, Cylinder, Geometry, Plane, Polyhedron, Sphere, manifold, signed_distance
+from mathota_jax.collision.pairs import PAIRS as METHODS
+from mathota_jax.collision.pairs import SEARCHED
 from tests.benchmarks.pair_report import run
-from tests.benchmarks.pose_sweep import GATES
-from tests.convex_oracle import Result, random_scene, rounded
-from tests.polytope_oracle import placed, polytope_distance, polytope_pairs, separations
+from tests.benchmarks.pose_sweep import GATES, gate
+from tests.convex_oracle import CORNERS, KINDS, PAIRS, Placed, Result, oracle, random_scene, rounded
+from tests.direction_oracle import direction_distance, extent, plane_distance, separation_along
+from tests.polytope_oracle import polytope_distance, polytope_pairs
 from tests.round_oracle import KINDS as ROUND
 from tests.round_oracle import round_distance
 
@@ -23,12 +30,40 @@ CLASSES = {"separated": (1e-2, 1.0), "touching": (-1e-4, 1e-4), "shallow": (-1e-
 """Separation [size], uniform between these; deep poses stay where they are drawn."""
 DEEP_REACH = 0.5
 """Largest distance [m] of the centres of deep poses."""
+DOUBTFUL = 0.1
+"""Where answer and oracle are further apart than this share of the gate, cutting planes decide."""
+PREFER_FACES = (("capsule", "box"), ("box", "box"))
+"""Pairs whose manifold takes a face for an edge up to 5 % shallower, and a direction close to a face normal for it."""
+BY_SUPPORT = "by support functions"
+EVERY = [("plane", kind) for kind in KINDS] + PAIRS
+SHAPES = {
+    "plane": Plane((0.0, 1.0, 0.0)),
+    "sphere": Sphere(1.0),
+    "capsule": Capsule(1.0, 1.0),
+    "box": Box((1.0, 1.0, 1.0)),
+    "cylinder": Cylinder(1.0, 1.0),
+    "cone": Cone(1.0, 1.0),
+    "polyhedron": Polyhedron(CORNERS),
+}
+"""A shape of each kind, whose sizes are replaced by those of the poses (a plane has none)."""
+
+
+class Answer(NamedTuple):
+    """What the engine says of each pose, float64."""
+
+    separation: np.ndarray
+    normal: np.ndarray
+    converged: np.ndarray
+
+
+Way = Callable[[tuple[str, str], dict, str], Answer]
+DISTANCE, MANIFOLD = jax.jit(jax.vmap(signed_distance)), jax.jit(jax.vmap(manifold))
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the sweep and writes both files."""
     meaning = "poses of each pair in each precision"
-    run("pose_classes", __doc__, (20000, meaning), polytope_pairs(), in_each_precision, table, arguments)
+    run("pose_classes", __doc__, (20000, meaning), EVERY, in_each_precision, table, arguments)
 
 
 def in_each_precision(pair: tuple[str, str], count: int) -> list[dict]:
@@ -37,14 +72,28 @@ def in_each_precision(pair: tuple[str, str], count: int) -> list[dict]:
     found = []
     for precision in ("float32", "float64"):
         with jax.enable_x64(precision == "float64"):
-            found += measure(pair, scene, kinds, sizes, precision)
+            found += measure(pair, scene, kinds, sizes, precision, ways(pair, precision))
             jax.clear_caches()
+    return found
+
+
+def ways(pair: tuple[str, str], precision: str) -> dict[str, Way]:
+    """Every way in which the engine finds the distance of a pair."""
+    found: dict[str, Way] = {METHODS[pair].method: registered}
+    if METHODS[pair].method not in SEARCHED and pair in PAIRS:
+        found[BY_SUPPORT] = searched
+    if METHODS[pair].distance is not None and pair not in PREFER_FACES and precision == "float32":
+        found["deepest contact point"] = deepest
     return found
 
 
 def exact(pair: tuple[str, str], scene: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances [m] and normals: in closed form where there is one."""
-    return (round_distance if set(pair) <= set(ROUND) else polytope_distance)(pair, scene)
+    if pair[0] == "plane":
+        return plane_distance(pair, scene)
+    if set(pair) <= set(ROUND):
+        return round_distance(pair, scene)
+    return (polytope_distance if pair in polytope_pairs() else direction_distance)(pair, scene)
 
 
 def draw(pair: tuple[str, str], count: int) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
@@ -55,11 +104,8 @@ def draw(pair: tuple[str, str], count: int) -> tuple[dict[str, Any], np.ndarray,
     scene["pb"] = np.where(
         (kinds == "deep")[:, None], scene["pa"] + DEEP_REACH / 2 * (scene["pb"] - scene["pa"]), scene["pb"]
     )
-    extents = [
-        np.linalg.norm(cores.corners - scene["p" + side][:, None], axis=2).max(1) + cores.radius
-        for side, cores in zip("ab", placed(pair, scene), strict=True)
-    ]
-    sizes = np.maximum(extents[0], extents[1])
+    extents = [extent(kind, scene[side]) for side, kind in zip("ab", pair, strict=True) if kind != "plane"]
+    sizes = np.max(extents, axis=0)
     truths, normals = exact(pair, scene)
     limits = np.array([CLASSES[kind] for kind in kinds])
     gaps = rng.uniform(limits[:, 0], limits[:, 1]) * sizes
@@ -68,24 +114,94 @@ def draw(pair: tuple[str, str], count: int) -> tuple[dict[str, Any], np.ndarray,
     return scene, kinds, sizes
 
 
-def measure(pair: tuple[str, str], scene: dict, kinds: np.ndarray, sizes: np.ndarray, precision: str) -> list[dict]:
-    """Worst errors and counts of each class in one precision."""
+def searched(pair: tuple[str, str], scene: dict, precision: str) -> Answer:
+    """By support functions, also where there is a closed form."""
+    found = Result(pair, scene, np.dtype(precision))
+    return Answer(found.separation, found.normal, found.converged)
+
+
+def registered(pair: tuple[str, str], scene: dict, precision: str) -> Answer:
+    """As `signed_distance` answers."""
+    found = DISTANCE(*arguments(pair, scene, precision))
+    return Answer(*(np.asarray(x, float) for x in (found.separation, found.normal)), np.asarray(found.converged))
+
+
+def deepest(pair: tuple[str, str], scene: dict, precision: str) -> Answer:
+    """The deepest point of the manifold, with the flag of the distance."""
+    found = MANIFOLD(*arguments(pair, scene, precision))
+    separation = jnp.where(found.active, found.separation, jnp.inf).min(axis=1)
+    converged = DISTANCE(*arguments(pair, scene, precision)).converged
+    return Answer(*(np.asarray(x, float) for x in (separation, found.normal)), np.asarray(converged))
+
+
+def arguments(pair: tuple[str, str], scene: dict, precision: str) -> tuple:
+    """Geometries and poses as `signed_distance` takes them, one a row."""
+    dtype = np.dtype(precision)
+    geometries, poses = [], []
+    for side, kind in zip("ab", pair, strict=True):
+        geometry = Geometry.of(SHAPES[kind])
+        same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(scene["pa"]), *leaf.shape)), geometry.parameters)
+        sizes = same if kind == "plane" else {n: jnp.asarray(v, dtype) for n, v in scene[side].items()}
+        geometries.append(dataclasses.replace(geometry, parameters=sizes))
+        poses.append(tuple(jnp.asarray(scene[what + side], dtype) for what in "pq"))
+    return geometries[0], poses[0], geometries[1], poses[1]
+
+
+def measure(
+    pair: tuple[str, str],
+    scene: dict,
+    kinds: np.ndarray,
+    sizes: np.ndarray,
+    precision: str,
+    answers: dict[str, Way] | None = None,
+) -> list[dict]:
+    """Worst errors and counts of each class in one precision, by each of the ways; by support functions if not given."""
     scene = rounded(scene, precision)
     truths, _ = exact(pair, scene)
-    result = Result(pair, scene, np.dtype(precision))
-    unit = result.normal / np.linalg.norm(result.normal, axis=1, keepdims=True)
-    a, b = placed(pair, scene)
-    reach = separations(a, b, unit[:, None])[:, 0]
-    separation, normal = np.abs(result.separation - truths) / sizes, np.abs(reach - truths) / sizes
-    gate = GATES[precision][0]
-    wrong = ~(np.maximum(separation, normal) <= gate)
-    flips = ((result.separation < 0) != (truths < 0)) & (np.abs(truths) > gate * sizes)
+    missed = np.zeros(len(truths), bool)
+    rows = []
+    for method, answer in ({BY_SUPPORT: searched} if answers is None else answers).items():
+        result = answer(pair, scene, precision)
+        rows += _compare(pair, scene, kinds, sizes, precision, truths, missed, method, result)
+    return rows
+
+
+def _compare(
+    pair: tuple[str, str],
+    scene: dict,
+    kinds: np.ndarray,
+    sizes: np.ndarray,
+    precision: str,
+    truths: np.ndarray,
+    missed: np.ndarray,
+    method: str,
+    result: Answer,
+) -> list[dict]:
+    """Rows of one way. Where a direction or cutting planes do better than `truths`, these are replaced, `missed` set."""
+    reach = separation_along(pair, scene, result.normal / np.linalg.norm(result.normal, axis=1, keepdims=True))
+    limit = gate(pair, np.dtype(precision))
+
+    def errors() -> np.ndarray:
+        return np.abs([result.separation - truths, reach - truths]) / sizes
+
+    if pair[0] != "plane":
+        # No separation along any direction, the engine's included, is more than the signed distance.
+        missed |= reach > truths + DOUBTFUL * limit * sizes
+        np.maximum(truths, reach, out=truths)
+        for index in np.flatnonzero(~(errors().max(0) <= DOUBTFUL * limit)):
+            better = oracle(Placed(pair, scene, index), 1e-11)[0]
+            missed[index] |= better > truths[index] + DOUBTFUL * limit * sizes[index]
+            truths[index] = max(truths[index], better)
+    separation, normal = errors()
+    wrong = ~(np.maximum(separation, normal) <= limit)
+    flips = ((result.separation < 0) != (truths < 0)) & (np.abs(truths) > limit * sizes)
     rows = []
     for kind in CLASSES:
         chosen = kinds == kind
         rows.append(
             {
                 "pair": "_".join(pair),
+                "method": method,
                 "class": kind,
                 "precision": precision,
                 "poses": int(chosen.sum()),
@@ -95,6 +211,7 @@ def measure(pair: tuple[str, str], scene: dict, kinds: np.ndarray, sizes: np.nda
                 "flips": int((flips & chosen).sum()),
                 "separation": float(separation[chosen].max()),
                 "normal": float(normal[chosen].max()),
+                "oracle_missed": int((missed & chosen).sum()),
             }
         )
     return rows
@@ -103,27 +220,33 @@ def measure(pair: tuple[str, str], scene: dict, kinds: np.ndarray, sizes: np.nda
 def table(rows: list[dict]) -> str:
     """The report in Markdown."""
     lines = [
-        "# Convex distance in many random poses",
+        "# Signed distances in many random poses",
         "",
         "Written by `python -m tests.benchmarks.pose_classes`: a quarter of the poses of each pair separated (0.01 to 1",
-        "size), touching (within 1e-4), shallow (1e-4 to 0.01 deep) and deep (centres within 0.5 m). Truth in float64 by",
-        "closed forms (spheres, capsules) or the best of all directions that can separate polytopes. Errors in units of the",
-        "larger shape: of the separation, and of the normal (separation lost along it). *Flagged*: `converged` is false.",
-        f"*Wrong*: either beyond {GATES['float32'][0]:g} (float32), {GATES['float64'][0]:g} (float64). *Flips*:",
-        "wrong sign beyond that. Pairs with a cylinder or cone: see [collision_accuracy](collision_accuracy.md).",
+        "size), touching (within 1e-4), shallow (1e-4 to 0.01 deep) and deep (centres within 0.5 m). Answers of",
+        "`signed_distance`; where that has a closed form or its own axes also of the search by support functions; where",
+        "the manifold is found apart from the distance, in float32 also its deepest point.",
+        "Truth in float64: closed forms (planes, spheres, capsules), the best of all directions that can separate",
+        "(polytopes), else a search of all directions. Where an answer is further from it than a tenth of the gate, cutting",
+        "planes with a proof (NNLS, Qhull) decide; *oracle missed* counts where these, or the separation along the engine's",
+        "normal (a lower bound, taken by the oracle), did better. Errors in units of the larger shape: of the separation,",
+        "and of the normal (separation lost along it).",
+        f"*Flagged*: `converged` is false. *Wrong*: either beyond {GATES['float32'][0]:g} (float32), "
+        f"{GATES['float64'][0]:g} (float64),",
+        f"{GATES['float64'][1]:g} (float64 with a cylinder or cone). *Flips*: wrong sign beyond that.",
     ]
-    keys = ("poses", "flagged", "wrong", "wrong_unflagged", "flips")
+    keys = ("poses", "flagged", "wrong", "wrong_unflagged", "flips", "oracle_missed")
     for precision in ("float32", "float64"):
-        lines += ["", f"## {precision}", "", "| Pair | class | poses | flagged | wrong | wrong, not flagged | flips |"]
-        lines[-1] += " separation | normal |"
-        lines.append("|---|---|---|---|---|---|---|---|---|")
+        lines += ["", f"## {precision}", "", "| Pair | method | class | poses | flagged | wrong | wrong, not flagged |"]
+        lines[-1] += " flips | oracle missed | separation | normal |"
+        lines.append("|---|---|---|---|---|---|---|---|---|---|---|")
         chosen = [row for row in rows if row["precision"] == precision]
         for row in chosen:
-            cells = [row["pair"], row["class"], *(str(row[key]) for key in keys)]
+            cells = [row["pair"], row["method"], row["class"], *(str(row[key]) for key in keys)]
             lines.append(f"| {' | '.join(cells)} | {row['separation']:.1e} | {row['normal']:.1e} |")
         totals = " | ".join(str(sum(row[key] for row in chosen)) for key in keys)
         worst = [f"{max(row[key] for row in chosen):.1e}" for key in ("separation", "normal")]
-        lines.append(f"| all |  | {totals} | {' | '.join(worst)} |")
+        lines.append(f"| all |  |  | {totals} | {' | '.join(worst)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -30,6 +30,7 @@ from tests.convex_oracle import (
     rounded,
     to_engine,
 )
+from tests.direction_oracle import direction_distance
 from tests.hulls import BOX_CORNERS
 from tests.polytope_oracle import polytope_distance, polytope_pairs
 
@@ -89,18 +90,28 @@ def test_what_is_not_flagged_is_right(pair, kind, precision):
     assert result["converged"].mean() >= (0.7 if kind.startswith("needles") else 0.9)
 
 
-POLYTOPE_PAIRS = [
-    pytest.param(pair, id="_".join(pair), marks=() if pair == ("capsule", "polyhedron") else pytest.mark.slow)
-    for pair in polytope_pairs()
-]
-
-
-@pytest.mark.parametrize("pair", POLYTOPE_PAIRS)
+@pytest.mark.parametrize(
+    "pair",
+    [
+        pytest.param(pair, id="_".join(pair), marks=() if pair == ("capsule", "polyhedron") else pytest.mark.slow)
+        for pair in pose_classes.EVERY
+    ],
+)
 def test_separated_touching_shallow_and_deep_poses(pair, precision):
     """Nothing wrong without a flag and no wrong sign; see `tests.benchmarks.pose_classes` for 20,000 of each pair."""
-    for row in pose_classes.measure(pair, *pose_classes.draw(pair, 2000), np.dtype(precision).name):
+    name = np.dtype(precision).name
+    for row in pose_classes.measure(pair, *pose_classes.draw(pair, 2000), name, pose_classes.ways(pair, name)):
         assert row["wrong_unflagged"] == row["flips"] == 0, row
-        assert row["flagged"] <= 10, row
+        # Overlaps of curved shapes are right long before they are proved.
+        assert row["flagged"] <= (0.15 * row["poses"] if {"cylinder", "cone"} & set(pair) else 10), row
+
+
+@pytest.mark.parametrize("pair", [("cylinder", "cone"), pytest.param(("cone", "polyhedron"), marks=pytest.mark.slow)])
+def test_the_search_of_directions_agrees_with_cutting_planes(pair):
+    scene = random_scene(pair, 20, reach=1.5)
+    truths, _ = direction_distance(pair, scene)
+    expected = [oracle(Placed(pair, scene, index))[0] for index in range(20)]
+    np.testing.assert_allclose(truths, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("pair", polytope_pairs())

@@ -9,7 +9,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mathota_jax
-from mathota_jax import Box, Capsule, Geometry, Plane, Sphere, closest_points, manifold, signed_distance, time_of_impact
+from mathota_jax import (
+    Box,
+    Capsule,
+    Cone,
+    Cylinder,
+    Geometry,
+    Plane,
+    Sphere,
+    closest_points,
+    manifold,
+    signed_distance,
+    time_of_impact,
+)
 from mathota_jax.collision.pairs import CLOSED_FORM, PAIRS, SEPARATING_AXES
 from mathota_jax.geometry import SHAPES
 
@@ -125,6 +137,78 @@ def test_box_flat_on_a_box_has_four_contact_points():
     np.testing.assert_allclose(found.separation, -0.05, atol=1e-6)
     np.testing.assert_allclose(sorted(map(tuple, np.asarray(found.position)[:, [0, 2]].round(5).tolist())),
                                [(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("sizes", "pose_a", "pose_b"),
+    [
+        # Found by `tests.benchmarks.pose_classes`: points 3.4 and 1.8 mm below the surfaces, and 0.4 mm above the deepest.
+        (
+            (0.557, 0.4218, 0.6451, 0.215),
+            (0.102, 0.0521, -0.0111, 0.1546, 0.2639, -0.5337, 0.7885),
+            (0.6318, -0.6071, 0.5793, -0.5457, -0.0704, -0.0159, 0.8349),
+        ),
+        (
+            (0.3794, 0.7855, 0.6488, 0.6618),
+            (-0.004, 0.1346, -0.1042, 0.082, -0.5626, 0.728, -0.3831),
+            (-1.0603, -0.4934, -1.5133, 0.0865, -0.3101, -0.8979, 0.3003),
+        ),
+        (
+            (0.8557, 0.3606, 0.6449, 0.9224),
+            (0.1157, -0.0353, -0.0195, 0.0761, 0.4921, 0.5822, -0.6427),
+            (-0.1579, -1.0001, -1.042, -0.3433, 0.7468, -0.0543, 0.567),
+        ),
+    ],
+)
+def test_the_deepest_contact_point_is_at_the_distance(precision, sizes, pose_a, pose_b):
+    """A steep face against a flat one: neither deeper (a phantom contact) nor shallower than the shapes are."""
+    shapes = Cylinder(*sizes[:2]), Cone(*sizes[2:])
+    poses = [at(*pose[:3], orientation=np.array(pose[3:]) / np.linalg.norm(pose[3:])) for pose in (pose_a, pose_b)]
+    found = manifold(shapes[0], poses[0], shapes[1], poses[1])
+    expected = signed_distance(shapes[0], poses[0], shapes[1], poses[1]).separation
+    least = np.where(found.active, found.separation, np.inf).min()
+    assert abs(least - expected) < (2e-5 if precision == np.float32 else 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("radius", "half_height", "half_extents", "pose_a", "pose_b"),
+    [
+        # Steep capsules whose closest point lies beside a face: the part over the face is 48 and 13 mm higher.
+        (
+            0.9305, 0.6743, (0.996, 0.3936, 0.2852),
+            (-0.1251, -0.0159, 0.0676, -0.1843, 0.7453, 0.4531, -0.453),
+            (-1.3733, 1.2017, 0.8688, 0.4339, 0.7519, 0.4706, 0.1575),
+        ),
+        (
+            0.7851, 0.2979, (0.6183, 0.2161, 0.7457),
+            (0.1169, -0.0409, -0.1938, -0.6793, -0.1572, 0.7137, -0.0668),
+            (0.4776, 1.3709, 0.4449, -0.8031, -0.2052, 0.5533, -0.0824),
+        ),
+    ],
+)  # fmt: skip
+def test_a_steep_capsule_beside_a_face(precision, radius, half_height, half_extents, pose_a, pose_b):
+    shapes = Capsule(radius, half_height), Box(half_extents)
+    poses = [at(*pose[:3], orientation=np.array(pose[3:]) / np.linalg.norm(pose[3:])) for pose in (pose_a, pose_b)]
+    found = manifold(shapes[0], poses[0], shapes[1], poses[1])
+    near = signed_distance(shapes[0], poses[0], shapes[1], poses[1])
+    assert abs(np.where(found.active, found.separation, np.inf).min() - near.separation) < 2e-5
+    np.testing.assert_allclose(found.normal, near.normal, atol=1e-5)
+
+
+@pytest.mark.parametrize("depth", [1e-6, 1e-5, 1e-4])
+def test_axes_of_capsules_that_all_but_meet(precision, depth):
+    """The normal is across both axes, not the difference of the closest points, which is round-off."""
+    turn = turned((0.36, 0.48, 0.8), 0.7)
+    rotation = Rotation.from_quat(turn[[1, 2, 3, 0]])
+    crossed = (rotation * Rotation.from_rotvec([0, 0, 1.1])).as_quat()[[3, 0, 1, 2]]
+    place = np.array([0.3, -0.7, 0.2])
+    shape = Capsule(0.4, 0.9)
+    poses = at(*place, orientation=turn), at(*(place + rotation.apply([0, 0.1, depth])), orientation=crossed)
+    found = signed_distance(shape, poses[0], shape, poses[1])
+    np.testing.assert_allclose(found.separation, depth - 0.8, atol=1e-6)
+    np.testing.assert_allclose(
+        found.normal, rotation.apply([0, 0, 1.0]), atol=2e-6 if precision == np.float32 else 1e-12
+    )
 
 
 # ---- time of impact ----------------------------------------------------------------------------------------------

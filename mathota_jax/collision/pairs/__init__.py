@@ -6,9 +6,9 @@ from mathota_jax.collision.box_distance import box_distance
 from mathota_jax.collision.convex.polytope import are_polytopes
 from mathota_jax.collision.manifold import Manifold, Nearest
 from mathota_jax.collision.pairs.box_box import box_box
-from mathota_jax.collision.pairs.capsule_box import capsule_box
-from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule
-from mathota_jax.collision.pairs.convex import convex_pair, convex_point_count
+from mathota_jax.collision.pairs.capsule_box import capsule_box, capsule_box_distance
+from mathota_jax.collision.pairs.capsule_capsule import capsule_capsule, capsule_distance
+from mathota_jax.collision.pairs.convex import convex_nearest, convex_pair, convex_point_count
 from mathota_jax.collision.pairs.convex_heightfield import HEIGHTFIELD_POINTS, heightfield_pair
 from mathota_jax.collision.pairs.convex_heightfield import KINDS as HEIGHTFIELD_KINDS
 from mathota_jax.collision.pairs.plane_box import plane_box
@@ -68,7 +68,7 @@ class Pair(NamedTuple):
 
 def _convex(kind_a: str, kind_b: str) -> Pair:
     method = SEARCHED_AXES if are_polytopes((kind_a, kind_b)) else SEARCHED_CURVED
-    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), method)
+    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), method, convex_nearest(kind_a, kind_b))
 
 
 PAIRS: dict[tuple[str, str], Pair] = {
@@ -84,8 +84,8 @@ PAIRS: dict[tuple[str, str], Pair] = {
     ("sphere", "cylinder"): Pair(sphere_cylinder, 1),
     ("sphere", "cone"): Pair(sphere_cone, 1),
     ("sphere", "polyhedron"): Pair(sphere_polyhedron, 1),
-    ("capsule", "capsule"): Pair(capsule_capsule, 2),
-    ("capsule", "box"): Pair(capsule_box, 2),
+    ("capsule", "capsule"): Pair(capsule_capsule, 2, CLOSED_FORM, capsule_distance),
+    ("capsule", "box"): Pair(capsule_box, 2, CLOSED_FORM, capsule_box_distance),
     ("box", "box"): Pair(box_box, 4, SEPARATING_AXES, box_distance),
 }
 PAIRS |= {

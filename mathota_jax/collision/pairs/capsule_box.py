@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.closest import clamp, clamp_to_box, round_point
-from mathota_jax.collision.manifold import Manifold
+from mathota_jax.collision.manifold import Manifold, Nearest
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import settle, settle_code
 from mathota_jax.spatial.vector import Vec3, dot, where
@@ -17,6 +17,8 @@ FACE_SINE_SQUARED = 1e-4
 """Closest points whose direction is this near to a face normal (squared sine) count as face contact: two points."""
 SLAB_TOLERANCE = 1e-3
 """The face is widened by this share of the capsule's size while deciding where the segment leaves it."""
+BESIDE = 1e-5
+"""... unless the segment is closer than its part over the face by this share of the capsule's size."""
 EDGE_DEPTH_SHARE = 0.05
 EDGE_MARGIN = 1e-3
 """When the segment enters the box an edge must be shallower than the best face by these shares of depth and size."""
@@ -48,9 +50,17 @@ def capsule_box(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose
     tiny = (16.0 * jnp.finfo(squared.dtype).eps * size) ** 2
     mode = _mode(center, reach, half, gap, squared, tiny, size)
 
-    on_face, on_edge, on_closest = mode < FIRST_EDGE, (mode >= FIRST_EDGE) & (mode < CLOSEST), mode == CLOSEST
+    on_edge = (mode >= FIRST_EDGE) & (mode < CLOSEST)
     axis = jnp.where(on_edge, mode - FIRST_EDGE, mode) >> 1
     sign = jnp.where((mode & 1) == 1, 1.0, -1.0).astype(squared.dtype)
+    starts, enters = _crossing(center, reach, half, axis, mode < FIRST_EDGE, size, -1.0)
+    ends, leaves = _crossing(center, reach, half, axis, mode < FIRST_EDGE, size, 1.0)
+    # A steep segment may be closest beside the face, well below what lies over it.
+    lowest = lax.stop_gradient(jnp.minimum(*(_height(center, reach, half, axis, sign, t) for t in (starts, ends))))
+    reached = jnp.sqrt(lax.stop_gradient(squared)) + BESIDE * size
+    beside = (lax.stop_gradient(squared) > tiny) & (lowest > reached)
+    on_face = settle(((mode < FIRST_EDGE) & ~beside).astype(squared.dtype)) > 0.5
+    on_closest = ~(on_face | on_edge)
 
     inverse = jnp.where(on_closest, 1.0 / jnp.sqrt(jnp.where(on_closest, squared, 1.0)), 0.0)
     edge_normal, edge_parameter, edge_point = _edge(center, reach, half, axis, sign, on_edge)
@@ -58,8 +68,6 @@ def capsule_box(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose
     outward = where(on_face, face_normal, where(on_edge, edge_normal, gap * inverse))
     normal = -pose_b.rotation.apply(outward)
 
-    starts, enters = _crossing(center, reach, half, axis, on_face, size, -1.0)
-    ends, leaves = _crossing(center, reach, half, axis, on_face, size, 1.0)
     single = jnp.where(on_edge, edge_parameter, parameter)
     at_end = lax.stop_gradient(jnp.where(single <= -1.0, 0, jnp.where(single >= 1.0, 1, CLOSEST_FEATURE)))
     two = settle((on_face & (lax.stop_gradient(ends - starts) > SLAB_TOLERANCE)).astype(squared.dtype)) > 0.5
@@ -86,6 +94,53 @@ def capsule_box(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose
             )
         )
     return Manifold(normal, tuple(points))
+
+
+def capsule_box_distance(capsule: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose_b: Pose) -> Nearest:
+    """Exact signed distance: no face is read off, none preferred."""
+    assert pose_a.rotation is not None
+    assert pose_b.rotation is not None
+    radius, half = capsule["radius"], box["half_extents"]
+    center = pose_b.point_to_local(pose_a.position)
+    reach = pose_b.rotation.apply_transposed(pose_a.rotation.column_y) * capsule["half_height"]
+    parameter = _closest_parameter(center, reach, half)
+    core = center + reach * parameter
+    nearest = clamp_to_box(core, half)
+    gap = core - nearest
+    squared = dot(gap, gap)
+    number, size = squared.dtype, radius + capsule["half_height"]
+    tiny = (16.0 * jnp.finfo(number).eps * size) ** 2
+    overlap = _least_overlap(*lax.stop_gradient((center, reach, half)), 0.0, 0.0)
+    mode = settle_code(jnp.where(squared > tiny, float(CLOSEST), overlap))
+
+    on_face, on_closest = mode < FIRST_EDGE, mode == CLOSEST
+    on_edge = ~(on_face | on_closest)
+    axis = jnp.where(on_edge, mode - FIRST_EDGE, mode) >> 1
+    sign = jnp.where((mode & 1) == 1, 1.0, -1.0).astype(number)
+    inverse = jnp.where(on_closest, 1.0 / jnp.sqrt(jnp.where(on_closest, squared, 1.0)), 0.0)
+    edge_normal, edge_parameter, edge_point = _edge(center, reach, half, axis, sign, on_edge)
+    face_normal = Vec3(*(jnp.where(axis == k, sign, 0.0) for k in range(3)))
+    outward = where(on_face, face_normal, where(on_edge, edge_normal, gap * inverse))
+    # The end that is deepest below the face; of a level segment the point found inside of the box.
+    falls = lax.stop_gradient(dot(face_normal, reach))
+    level = jnp.abs(falls) <= 16.0 * jnp.finfo(number).eps * size
+    end = settle(jnp.where(level, parameter, -jnp.sign(falls)))
+    inner = center + reach * jnp.where(on_face, end, jnp.where(on_edge, edge_parameter, parameter))
+    below = Vec3(*(jnp.where(axis == k, sign * h, c) for k, (c, h) in enumerate(zip(inner, half, strict=True))))
+    surface = where(on_face, below, where(on_edge, edge_point, nearest))
+    normal = -pose_b.rotation.apply(outward)
+    return Nearest(
+        dot(outward, inner - surface) - radius,
+        normal,
+        pose_b.point_to_world(inner) + normal * radius,
+        pose_b.point_to_world(surface),
+    )
+
+
+def _height(center: Vec3, reach: Vec3, half: Vec3, axis: Array, sign: Array, parameter: Array) -> Array:
+    """Height of a point of the segment over a face."""
+    heights = [sign * (c + r * parameter) - h for c, r, h in zip(center, reach, half, strict=True)]
+    return jnp.where(axis == 0, heights[0], jnp.where(axis == 1, heights[1], heights[2]))
 
 
 def _not_zero(value: Array, scale: Any) -> Array:
@@ -138,7 +193,6 @@ def _closest_parameter(center: Vec3, reach: Vec3, half: Vec3) -> Array:
 def _mode(center: Vec3, reach: Vec3, half: Vec3, gap: Vec3, squared: Array, tiny: Any, size: Any) -> Array:
     """Settled mode of the contact, see `CLOSEST`."""
     center, reach, half, gap, squared, size = lax.stop_gradient((center, reach, half, gap, squared, size))
-    number = squared.dtype
     # Outside: the closest points, read as face contact where they point along a face normal.
     outside = jnp.full_like(squared, float(CLOSEST))
     for axis, component in enumerate(gap):
@@ -146,7 +200,13 @@ def _mode(center: Vec3, reach: Vec3, half: Vec3, gap: Vec3, squared: Array, tiny
         along = (lateral < FACE_SINE_SQUARED * squared) & _over_face(center, reach, half, axis, size)
         outside = jnp.where(along, 2.0 * axis + (component > 0), outside)
 
-    # The segment enters the box: least overlap, faces preferred.
+    overlap = _least_overlap(center, reach, half, EDGE_MARGIN * size, EDGE_DEPTH_SHARE)
+    return settle_code(jnp.where(squared > tiny, outside, overlap))
+
+
+def _least_overlap(center: Vec3, reach: Vec3, half: Vec3, margin: Any, share: float) -> Array:
+    """Mode of a segment that enters the box; an edge must be shallower than the best face by a margin and a share."""
+    number = center.x.dtype
     best, code = None, None
     for axis, (c, r, h) in enumerate(zip(center, reach, half, strict=True)):
         separation, this = jnp.abs(c) - h - jnp.abs(r), (2.0 * axis + (c > 0)).astype(number)
@@ -157,7 +217,7 @@ def _mode(center: Vec3, reach: Vec3, half: Vec3, gap: Vec3, squared: Array, tiny
             best, code = jnp.where(better, separation, best), jnp.where(better, this, code)
     assert best is not None
     assert code is not None
-    threshold = best + EDGE_MARGIN * size - EDGE_DEPTH_SHARE * best
+    threshold = best + margin - share * best
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         length = reach[i] * reach[i] + reach[j] * reach[j]
@@ -168,7 +228,7 @@ def _mode(center: Vec3, reach: Vec3, half: Vec3, gap: Vec3, squared: Array, tiny
         better = usable & (separation > threshold)
         threshold = jnp.where(better, separation, threshold)
         code = jnp.where(better, FIRST_EDGE + 2.0 * axis + (projection > 0), code)
-    return settle_code(jnp.where(squared > tiny, outside, code))
+    return code
 
 
 def _over_face(center: Vec3, reach: Vec3, half: Vec3, axis: int, size: Any) -> Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mathota_jax.collision.convex import convex_distance
 from mathota_jax.collision.face_manifold import face_manifold, point_count
 from mathota_jax.collision.faces import FACES
-from mathota_jax.collision.manifold import ContactPoint, Manifold
+from mathota_jax.collision.manifold import ContactPoint, Manifold, Nearest
 from mathota_jax.spatial.pose import Pose
 
 
@@ -29,6 +29,16 @@ def convex_pair(kind_a: str, kind_b: str) -> Callable[[dict[str, Any], Pose, dic
 
     pair.__name__ = f"{kind_a}_{kind_b}"
     return pair
+
+
+def convex_nearest(kind_a: str, kind_b: str) -> Callable[[dict[str, Any], Pose, dict[str, Any], Pose], Nearest]:
+    """Distance function of two kinds that have a support function."""
+
+    def nearest(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Nearest:
+        found = convex_distance(kind_a, a, pose_a, kind_b, b, pose_b)
+        return Nearest(found.separation, found.normal, found.point_a, found.point_b, found.converged)
+
+    return nearest
 
 
 def convex_point_count(kind_a: str, kind_b: str) -> int:
