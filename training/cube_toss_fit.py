@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from mathota_jax import Model, State
 from mathota_jax.fit import FitResult, Noise, Parameter, Trajectories, fit
-from mathota_jax.fit.arrays import rotation_between
 from training.cube_toss_data import UP, Tosses, as_rotation, fall, turned
 from training.cube_toss_model import (
     SUBSTEPS,
@@ -168,7 +167,7 @@ def _linearise(model: Model, state: State, known: CubeParameters, start: Start, 
     def errors(change: Any) -> Any:
         moved = _moved(known, change * UNCERTAINTY)
         position, orientation = simulate(model, state, moved, start, recorded[0].shape[1])
-        turn = rotation_between(recorded[1], orientation)
+        turn = _turn(recorded[1], orientation)
         return jnp.concatenate([(position - recorded[0]) * (100 / width), jnp.degrees(turn)], axis=-1)
 
     found, along = jax.linearize(errors, jnp.zeros(len(UNCERTAINTY), model.dt.dtype))
@@ -193,3 +192,14 @@ def _moved(known: CubeParameters, logarithms: Any) -> CubeParameters:
     factors = jnp.exp(logarithms)
     by_name = dict(zip(FITTED, (factors[0], factors[1], factors[2:5], factors[5]), strict=True))
     return known._replace(**{name: jnp.asarray(getattr(known, name)) * factor for name, factor in by_name.items()})
+
+
+def _turn(first: Any, second: Any) -> Any:
+    """Rotation vector (..., 3) from one orientation to another."""
+    w = jnp.sum(first * second, -1, keepdims=True)
+    vector = (
+        first[..., :1] * second[..., 1:] - second[..., :1] * first[..., 1:] + jnp.cross(second[..., 1:], first[..., 1:])
+    )
+    vector = jnp.where(w < 0, -vector, vector)
+    length = jnp.sqrt(jnp.sum(vector**2, -1, keepdims=True) + 1e-12)
+    return 2 * jnp.arctan2(length, jnp.abs(w)) * vector / length
