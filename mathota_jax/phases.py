@@ -22,7 +22,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity
 from mathota_jax.spatial.indexing import in_every_world, take
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, store_cotangents
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
 
@@ -40,6 +40,7 @@ def acting_inertia(model: Model, blocks: Bodies, inertia: Inertia) -> tuple[Iner
     """Inertia with which bodies respond to impulses: with mechanisms that of mid-step; see `carried_velocity`."""
     if layout(model.scene) is None or inertia.rotation is None:
         return inertia, None
+    blocks = store_cotangents(blocks)
     middle = inertia.at(joint_rows.moved_by(blocks, 0.5 * model.dt).orientation)
     return compute_once((middle, carried_velocity(blocks, inertia, middle)), blocks.position.x)
 
@@ -117,11 +118,11 @@ def _sweep(
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
     sweeps = 0 if known else iterations
-    return *pgs.solve(sweeps, _gradient_iterations(scene, iterations), rows, velocity, start), None
+    return *pgs.solve(sweeps, _gradient_iterations(scene, rows, iterations), rows, velocity, start), None
 
 
-def _gradient_iterations(scene: Scene, iterations: int) -> int:
-    return scene.options.gradient_iterations or 2 * iterations
+def _gradient_iterations(scene: Scene, rows: tuple[Rows, ...], iterations: int) -> int:
+    return scene.options.gradient_iterations or pgs.enough_for_derivatives(rows, iterations)
 
 
 def small_steps(
@@ -173,7 +174,8 @@ def correct_positions(
         correction = converged.solve(tuple(rows), zero, start)[0]
     else:
         iterations = options.position_iterations
-        correction, _ = pgs.solve(iterations, _gradient_iterations(scene, iterations), tuple(rows), zero, start)
+        gradient = _gradient_iterations(scene, tuple(rows), iterations)
+        correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start)
     return displace(moved, inertia, correction if back is None else correction + back)
 
 

@@ -174,7 +174,7 @@ def _rounds(
             rebounds.append(jnp.concatenate([rebound, zero[:, 1:]], axis=1))
             rows.append(dataclasses.replace(chosen, bias=zero))
         start = tuple(jnp.zeros_like(part) for part in total)
-        gradient = scene.options.gradient_iterations or 2 * iterations
+        gradient = scene.options.gradient_iterations or pgs.enough_for_derivatives(tuple(rows), iterations)
 
         def with_restitution(share: Array | float) -> Impulses:
             biased = tuple(

@@ -30,7 +30,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import exponential, multiply
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, store_cotangents
 from mathota_jax.spatial.vector import Vec3, cross
 
 
@@ -62,7 +62,7 @@ def joint_rows(model: Model, bodies: Bodies) -> JointRows:
     for group in joint_groups(model.scene):
         group_rows = rows_of(model, group, joint_frames(model, bodies, group.joints))
         parent_motion, child_motion = (
-            Side(*take((bodies.velocity, bodies.angular_velocity), group.members(model.scene, side)))
+            Side(*store_cotangents(take((bodies.velocity, bodies.angular_velocity), group.members(model.scene, side))))
             for side in ("parent", "child")
         )
         rates += [inner(row.parent, parent_motion) + inner(row.child, child_motion) for row in group_rows]
@@ -135,10 +135,9 @@ def _stack_vectors(values: list[Vec3], counts: list[int]) -> Vec3:
 
 def moved_by(bodies: Bodies, time: Array) -> Bodies:
     """Where the bodies are after some time at their present velocities."""
-    turn = exponential(bodies.angular_velocity * time)
-    return bodies._replace(
-        position=bodies.position + bodies.velocity * time, orientation=multiply(turn, bodies.orientation)
-    )
+    turn = store_cotangents(exponential(bodies.angular_velocity * time))
+    orientation = store_cotangents(multiply(turn, bodies.orientation))
+    return bodies._replace(position=bodies.position + bodies.velocity * time, orientation=orientation)
 
 
 def joint_coordinates(model: Model, bodies: Bodies) -> tuple[Array, Array]:

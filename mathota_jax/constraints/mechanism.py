@@ -28,7 +28,7 @@ from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, store, store_cotangents
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
 from mathota_jax.struct import pytree, static
 
@@ -205,9 +205,15 @@ def rates(links: Links, velocity: Array) -> Impulses:
     linear, angular = take(unpack_blocks(velocity), links.layout.blocks)
     parent_linear, parent_angular = (_of_parents(links.layout, part) for part in (linear, angular))
     linear = linear - parent_linear - cross(parent_angular, links.offset)
-    angular = angular - parent_angular
+    linear, angular = _stored(links, linear, angular - parent_angular)
     found = [dot(side.linear, linear) + dot(side.angular, angular) for side in links.translations]  # type: ignore[arg-type]
-    return _held(links, [*found, *(dot(direction, angular) for direction in links.rotations)])
+    return store_cotangents(_held(links, [*found, *(dot(direction, angular) for direction in links.rotations)]))
+
+
+def _stored(links: Links, linear: Vec3, angular: Vec3) -> tuple[Vec3, Vec3]:
+    """Vectors (link, world) that go into all six rows, computed once; linear in the vectors."""
+    # Different for each component: by a divisor that they share, XLA would multiply, and copy the product.
+    return Vec3(*map(store, linear, links.offset)), Vec3(*map(store, angular, links.rotations[0]))
 
 
 def push(links: Links, impulses: Impulses) -> Array:
@@ -218,6 +224,7 @@ def push(links: Links, impulses: Impulses) -> Array:
         force, torque = force + side.linear * impulse, torque + side.angular * impulse
     for direction, impulse in zip(links.rotations, impulses[3:], strict=True):
         torque = torque + direction * impulse
+    force, torque = store_cotangents(_stored(links, force, torque))
     carried = torque + cross(links.offset, force)
     force, torque = force - _to_parents(links.layout, force), torque - _to_parents(links.layout, carried)
     return _to_blocks(links.layout, pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque)))
@@ -241,14 +248,17 @@ def solve(links: Links, wanted: Impulses) -> Impulses:
 def _impulses(links: Links, wanted: Impulses) -> Impulses:
     """`solve` without derivatives."""
     translations, duals = lax.stop_gradient((links.translations, links.duals))
-    turn = _combine(duals[1], wanted[3:])
+    # Each goes into all components of a motion.
+    wanted = compute_once(wanted, wanted[0])
+    turn = compute_once(_combine(duals[1], wanted[3:]), wanted[0])
     shift = _combine(duals[0], wanted[:3]) + _shift_of_turn(translations, duals[0], turn)
+    shift = compute_once(shift, wanted[0])
     force = tree.force_for(links.layout.tree, links.factors, _pack(shift, turn))
     along, about = _unpack(force)
     linear = [dot(dual, along) for dual in duals[0]]
     for side, impulse in zip(translations, linear, strict=True):
         about = about - side.angular * impulse
-    return _held(links, [*linear, *(dot(dual, about) for dual in duals[1])])
+    return compute_once(_held(links, [*linear, *(dot(dual, about) for dual in duals[1])]), wanted[0])
 
 
 @jax.custom_jvp

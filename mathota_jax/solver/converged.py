@@ -292,6 +292,10 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple:
     velocity, impulses, failed = solve(rows, velocity, impulses)
     if not rows:
         return (velocity, impulses, failed), (d_velocity, impulses, jnp.zeros_like(failed))
-    d_velocity, jacobians, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
+    d_velocity, errors, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
+    jacobians = tuple(
+        implicit.jacobians_of(group.law, impulse, error)
+        for group, impulse, error in zip(rows, impulses, errors, strict=True)
+    )
     d_velocity, d_impulses = implicit.solve(rows, jacobians, right_sides, d_velocity)
     return (velocity, impulses, failed), (d_velocity, d_impulses, jnp.zeros_like(failed))

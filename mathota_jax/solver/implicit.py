@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import functools
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import velocity_system
+from mathota_jax.solver.laws import Law
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
 
 STEPS = 20
@@ -58,6 +60,19 @@ def solve(
     start = tuple(jnp.zeros_like(side) for side in settled)
     _, impulses = lax.fori_loop(0, STEPS, step, (jnp.zeros_like(velocity), start))
     return add_impulses(rows, velocity, impulses), impulses
+
+
+def jacobians_of(law: Law, impulse: Array, error: Array) -> tuple[Array, Array]:
+    """Jacobians (turn, row, row', column, world) of a law with respect to the impulse and the error."""
+    row_count = impulse.shape[1]
+
+    def column(argument: int, row: int) -> Array:
+        basis = jnp.zeros_like(impulse).at[:, row].set(1.0)
+        zero = jnp.zeros_like(impulse)
+        directions = (basis, zero) if argument == 0 else (zero, basis)
+        return jax.jvp(law.update, (impulse, error), directions)[1]
+
+    return tuple(jnp.stack([column(argument, row) for row in range(row_count)], axis=2) for argument in (0, 1))  # type: ignore[return-value]
 
 
 def _inverse(by_impulse: Array, delta: float) -> Array:

@@ -137,10 +137,11 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     RESULTS.mkdir(exist_ok=True)
     stored = RESULTS / "gradient_cost.json"
-    found = json.loads(stored.read_text()) if stored.exists() else {}
     what = [options.only] if options.only else list(MEASURES)
     for name, measure in itertools.product(options.scenes.split(","), what):
-        found[name] = {**found.get(name, {}), **MEASURES[measure](name)}
+        new = MEASURES[measure](name)
+        found = json.loads(stored.read_text()) if stored.exists() else {}
+        found[name] = {**found.get(name, {}), **new}
         ordered = {scene: found[scene] for scene in SCENES if scene in found}
         stored.write_text(json.dumps(ordered, indent=1) + "\n")
         (RESULTS / "gradient_cost.md").write_text(table(ordered))

@@ -24,13 +24,16 @@ from tests.fit.scenes import (
     struck_ball,
     unknown,
 )
+from tests.gradients.bystanders import add_bystanders
 from tests.scenes import undamped
 
 
-def dropped_ball():
+def dropped_ball(beside=False):
     builder = SceneBuilder(gravity=(0.0, -GRAVITY, 0.0))
     builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, restitution=0.9, name="ground")
     builder.add_body(Sphere(RADIUS), mass=1.0, restitution=0.9, position=(0, 1 + RADIUS, 0), name="ball")
+    if beside:
+        add_bystanders(builder)
     return builder.build(undamped())
 
 
@@ -41,13 +44,16 @@ def drops(restitution=0.8):
     return Trajectories("ball", 2.5 / 20, position)
 
 
-@pytest.fixture(scope="module")
-def drop_objective():
-    """Restitution by the heights, compiled once."""
-    model, state = dropped_ball()
+def restitution_by_heights(model, state):
     parameter = Parameter(("restitution[ball]", "restitution[ground]"))
     vector = parameter_vector(model, state, [parameter])
     return Objective(model, state, vector, drops(), Noise(), segment_count=1, substeps=30, start="model")
+
+
+@pytest.fixture(scope="module")
+def drop_objective():
+    """Restitution by the heights, compiled once."""
+    return restitution_by_heights(*dropped_ball())
 
 
 @pytest.mark.parametrize("start", [0.6, 0.95])
@@ -58,6 +64,14 @@ def test_restitution_over_several_bounces(drop_objective, start, gate):
     gate("restitution - 0.8", result.values[0] - 0.8, 1e-3)
     assert result.converged and result.steps <= 100
     assert not result.warnings
+
+
+@pytest.mark.slow
+def test_restitution_beside_others(precision, gate):
+    """The same in both precisions beside a contact at rest and a pair that never touches."""
+    objective = restitution_by_heights(*dropped_ball(beside=True))
+    for start in (0.6, 0.95):
+        test_restitution_over_several_bounces(objective, start, gate)
 
 
 def test_multiple_shooting(gate):

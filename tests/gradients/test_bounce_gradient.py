@@ -101,14 +101,15 @@ def test_one_bounce_under_gravity(precision, dt, gate):
     check(gate, slopes, UNDER_GRAVITY, LIMIT[str(precision)])
 
 
-@pytest.mark.parametrize(
-    ("bounces", "time", "height", "by_restitution", "by_drop"),
-    [
-        (1, 0.8, 0.639204, 1.543558, 0.589202),
-        (2, 1.5, 0.402862, 2.639013, 0.675556),
-        (4, 2.3, 0.119488, -3.195145, -0.999817),
-    ],
-)
+SEVERAL_BOUNCES = [
+    (1, 0.8, 0.639204, 1.543558, 0.589202),
+    (2, 1.5, 0.402862, 2.639013, 0.675556),
+    (4, 2.3, 0.119488, -3.195145, -0.999817),
+]
+"""Bounces, time, gap of a ball dropped by 1 m with restitution 0.8, and the slopes of the gap by restitution and drop."""
+
+
+@pytest.mark.parametrize(("bounces", "time", "height", "by_restitution", "by_drop"), SEVERAL_BOUNCES)
 def test_several_bounces(precision, bounces, time, height, by_restitution, by_drop, gate):
     value, slopes = run(height=1.0 + RADIUS, velocity=0.0, restitution=0.8, gravity=G, time=time, dt=1 / 240)
     gate(f"N={bounces}: gap / truth - 1", (value - RADIUS) / height - 1, 1e-2)

@@ -1,4 +1,4 @@
-"""The closed-form gradients once more (C1, C6, C9, C11), beside a resting contact and a pair that never touches."""
+"""The closed-form gradients once more (C1, C6, C8, C9, C11), beside a resting contact and a pair that never touches."""
 
 import dataclasses
 
@@ -9,7 +9,17 @@ import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, Sphere, rollout
 from tests.gradients.bystanders import add_bystanders
-from tests.gradients.test_bounce_gradient import LIMIT, RADIUS, UNDER_GRAVITY, G, check, parameters_of, value_and_slopes
+from tests.gradients.test_bounce_gradient import (
+    LIMIT,
+    RADIUS,
+    SEVERAL_BOUNCES,
+    UNDER_GRAVITY,
+    G,
+    check,
+    parameters_of,
+    value_and_slopes,
+)
+from tests.gradients.test_collision_impulse import check_struck_rod
 from tests.gradients.test_slide_gradient import derivatives
 from tests.gradients.test_stick_slip import COUNT, THRESHOLD, push_with_slopes
 from tests.marks import QUICK_AND_SLOW_PRECISION
@@ -28,10 +38,10 @@ def crowded(shape, gravity=DOWN, friction=0.5, restitution=0.0, dt=1 / 240, **bo
     return builder.build(undamped(dt=dt))
 
 
-def bounce(height, velocity, restitution, gravity, time):
+def bounce(height, velocity, restitution, gravity, time, count=240):
     model, state = crowded(Sphere(RADIUS), restitution=0.8, position=(0.0, 1.0, 0.0))
     parameters = parameters_of(height=height, velocity=velocity, restitution=restitution, gravity=gravity, time=time)
-    return value_and_slopes(parameters, model, state, 240)
+    return value_and_slopes(parameters, model, state, count)
 
 
 @PRECISIONS
@@ -42,6 +52,15 @@ def test_one_bounce(precision, gate):
     value, slopes = bounce(1.0, 0.0, 0.8, G, 0.8)
     gate("C1b: height / truth - 1", value / 0.671884928 - 1, 1e-3)
     check(gate, slopes, UNDER_GRAVITY, LIMIT[str(precision)])
+
+
+@PRECISIONS
+def test_several_bounces(precision, gate):
+    """All in one program: steps of 1/240 s for the longest."""
+    for bounces, time, height, by_restitution, by_drop in SEVERAL_BOUNCES:
+        value, slopes = bounce(1.0 + RADIUS, 0.0, 0.8, G, time, count=552)
+        gate(f"C8: N={bounces}: gap / truth - 1", (value - RADIUS) / height - 1, 1e-2)
+        check(gate, slopes, {"restitution": by_restitution, "height": by_drop}, 1e-2)
 
 
 @pytest.mark.slow  # boxes in reverse mode compile for half a minute
@@ -94,3 +113,8 @@ def test_head_on_collision(precision, gate):
     gate("C9: velocity / truth - 1", value / 0.85 - 1, limit)
     for name, truth in {"m1": 0.6375, "m2": -0.2125, "e": 0.5, "v": 0.425}.items():
         gate(f"C9: d v2 / d {name} / truth - 1", slopes[name] / truth - 1, limit)
+
+
+@pytest.mark.slow
+def test_rod_struck_off_centre(precision, gate):
+    check_struck_rod(gate, str(precision), 5.0, lambda builder, surface: add_bystanders(builder, **surface))

@@ -9,7 +9,7 @@ import pytest
 
 from mathota_jax import Options, Sphere, rollout, step
 from mathota_jax.solver import pgs
-from tests.scenes import body_on_plane, box_stack, undamped
+from tests.scenes import body_on_plane, box_stack, slab_on_plane, undamped
 from tests.unit.test_converged import BODIES, random_problem, rows_of
 
 
@@ -37,6 +37,36 @@ def test_unrolled_sweeps_have_the_implicit_derivative(float64, friction, gate):
     )
     gate("4000 sweeps: unrolled - implicit", many - truth, 1e-9)
     assert np.abs(few - truth).max() > 1e-6  # 10 sweeps are not enough: the comparison can fail
+
+
+@jax.jit
+def pushed(model, state, push):
+    """Velocities after a step by a push [N] along x at the middle of the slab, and their derivatives by those before."""
+
+    def after(velocity, angular_velocity):
+        moving = dataclasses.replace(
+            state,
+            velocity=state.velocity.at[1].set(velocity),
+            angular_velocity=state.angular_velocity.at[1].set(angular_velocity),
+            applied_force=state.applied_force.at[1, 0].set(push),
+        )
+        new = step(model, moving)
+        return jnp.concatenate([new.velocity[1], new.angular_velocity[1]]), new
+
+    return jax.jacfwd(after, argnums=(0, 1), has_aux=True)(state.velocity[1], state.angular_velocity[1])
+
+
+def test_few_sweeps_behind_a_derivative_are_enough(float64, gate):
+    """The default number of linear sweeps against the limit of many, where a slab sticks and where it slips."""
+    (model, state), (exact, _) = (
+        slab_on_plane(friction=0.4, options=undamped(dt=1 / 240, gradient_iterations=sweeps)) for sweeps in (None, 300)
+    )
+    for push in (2.0, 12.0):
+        current = state
+        for _ in range(4):
+            _, current = pushed(model, current, push)
+        (found, _), (truth, _) = (pushed(which, current, push) for which in (model, exact))
+        gate(f"push {push}: slopes", np.concatenate(found, 1) - np.concatenate(truth, 1), 1e-3)
 
 
 def test_memory_does_not_grow_with_the_sweeps():

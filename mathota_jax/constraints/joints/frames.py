@@ -11,7 +11,7 @@ from mathota_jax.bodies import Bodies, quaternion, vector
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, store_cotangents
 from mathota_jax.spatial.vector import Mat3, Vec3
 
 
@@ -38,8 +38,9 @@ def joint_frames(model: Model, bodies: Bodies, joints: tuple[int, ...]) -> Joint
     """Frames of the given joints at the poses of all bodies."""
     entries = [model.scene.joints[joint] for joint in joints]
     parents, children = [entry.parent for entry in entries], [entry.child for entry in entries]
-    parent_position, parent_orientation = take((bodies.position, bodies.orientation), parents)
-    child_position, child_orientation = take((bodies.position, bodies.orientation), children)
+    # The derivative by a pose goes through all rows of its joints: once for each component is enough.
+    parent_position, parent_orientation = store_cotangents(take((bodies.position, bodies.orientation), parents))
+    child_position, child_orientation = store_cotangents(take((bodies.position, bodies.orientation), children))
     anchor_parent, anchor_child, frame_parent, frame_child = take(
         (
             vector(model.joint_anchor_parent),
@@ -52,7 +53,9 @@ def joint_frames(model: Model, bodies: Bodies, joints: tuple[int, ...]) -> Joint
     arm_parent = to_matrix(parent_orientation).apply(anchor_parent)
     arm_child = to_matrix(child_orientation).apply(anchor_child)
     offset = (child_position + arm_child) - (parent_position + arm_parent)
-    parent, child = multiply(parent_orientation, frame_parent), multiply(child_orientation, frame_child)
+    parent, child = store_cotangents(
+        (multiply(parent_orientation, frame_parent), multiply(child_orientation, frame_child))
+    )
     inverse = Quaternion(parent.w, -parent.x, -parent.y, -parent.z)
     frames = JointFrames(
         arm_parent + offset, arm_child, offset, to_matrix(parent), to_matrix(child), multiply(inverse, child)

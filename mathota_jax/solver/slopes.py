@@ -1,0 +1,121 @@
+"""How the impulses that a law gives change with the impulses before and with the errors.
+
+What the sweeps behind a derivative apply at every turn, forward and, for reverse mode, transposed: a few numbers a row
+instead of the Jacobians. Arrays of changes are (row, column, world) or, for a whole table, (turn, row, ...).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from mathota_jax.solver.laws import Bounded, Cone, Law
+from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.struct import pytree
+
+
+@pytree
+class BoundedSlopes:
+    """Of scalar rows, each by itself.
+
+    Attributes:
+      by_impulse, by_error: as the impulses.
+    """
+
+    by_impulse: Array
+    by_error: Array
+
+    def update(self, impulse: Array, error: Array) -> Array:
+        """Change of the new impulses by those of the impulses before and of the errors."""
+        return self.by_impulse * impulse + self.by_error * error
+
+    def transposed(self, new: Array) -> tuple[Array, Array]:
+        """The transpose of `update`."""
+        return self.by_impulse * new, self.by_error * new
+
+
+@pytree
+class ConeSlopes:
+    """Of a contact with friction, (column, world) without a row.
+
+    Attributes:
+      pressing: 1 where the normal impulse is above its bound, 0 where it is not.
+      normal_mass, tangent_mass: those of the law.
+      grip: share that is left of a tangential change across the direction of sliding; 1 where the contact sticks.
+      direction: two components of the tangential impulse over its size; 0 where the contact sticks.
+      friction: the coefficient.
+    """
+
+    pressing: Array
+    normal_mass: Array
+    tangent_mass: Array
+    grip: Array
+    direction: tuple[Array, Array]
+    friction: Array
+
+    def update(self, impulse: Array, error: Array) -> Array:
+        """As `BoundedSlopes.update`."""
+        row = impulse.ndim - 3
+        (normal, *tangents), (error_n, *errors) = unstack(impulse, row), unstack(error, row)
+        normal = self.pressing * (normal - self.normal_mass * error_n)
+        free = [old - self.tangent_mass * error for old, error in zip(tangents, errors, strict=True)]
+        return self._stack(normal, self._held(free, self.friction * normal), row)
+
+    def transposed(self, new: Array) -> tuple[Array, Array]:
+        """As `BoundedSlopes.transposed`."""
+        row = new.ndim - 3
+        normal, *tangents = unstack(new, row)
+        normal = self.pressing * (normal + self.friction * self._along(tangents))
+        free = self._held(tangents, 0.0)
+        by_error = self._stack(-self.normal_mass * normal, [-self.tangent_mass * part for part in free], row)
+        return self._stack(normal, free, row), by_error
+
+    def _along(self, tangents: Sequence[Array]) -> Array:
+        return self.direction[0] * tangents[0] + self.direction[1] * tangents[1]
+
+    def _held(self, free: Sequence[Array], limit: Array | float) -> list[Array]:
+        """What friction makes of tangential changes: across the direction of sliding a share, along it that of the limit."""
+        along = limit - self.grip * self._along(free)
+        return [self.grip * part + own * along for part, own in zip(free, self.direction, strict=True)]
+
+    @staticmethod
+    def _stack(normal: Array, tangents: Sequence[Array], row: int) -> Array:
+        return jnp.stack([normal, *tangents], axis=row)
+
+
+Slopes = BoundedSlopes | ConeSlopes
+
+
+def slopes_of(law: Law, impulse: Array, error: Array) -> Slopes:
+    """Those of a law of a whole table at its fixed point, stored."""
+    if isinstance(law, Bounded):
+        one, zero = jnp.ones_like(impulse), jnp.zeros_like(impulse)
+        by_impulse, by_error = (
+            jax.jvp(law.update, (impulse, error), change)[1] for change in ((one, zero), (zero, one))
+        )
+        return compute_once(BoundedSlopes(by_impulse, by_error), impulse)
+    return compute_once(_of_cone(law, impulse, error), impulse)
+
+
+def _of_cone(law: Cone, impulse: Array, error: Array) -> ConeSlopes:
+    old, *tangents = unstack(impulse, 1)
+    error_n, *errors = unstack(error, 1)
+    free = old - error_n * law.normal_mass
+    normal, pressing = jax.jvp(lambda x: jnp.maximum(x, 0.0), (free,), (jnp.ones_like(free),))
+    free_1, free_2 = (part - slip * law.tangent_mass for part, slip in zip(tangents, errors, strict=True))
+    squared, limit = free_1 * free_1 + free_2 * free_2, law.friction * normal
+    sliding, size = squared >= limit * limit, safe_sqrt(squared)
+    direction = tuple(jnp.where(sliding, safe_divide(part, size), 0.0) for part in (free_1, free_2))
+    return ConeSlopes(
+        pressing=pressing,
+        normal_mass=law.normal_mass,
+        tangent_mass=law.tangent_mass,
+        grip=jnp.where(sliding, safe_divide(limit, size), 1.0),
+        direction=direction,  # type: ignore[arg-type]
+        friction=law.friction,
+    )
