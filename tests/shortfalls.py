@@ -8,10 +8,6 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_mechanism_steps.py::test_a_loop_with_too_many_joints_stays_finite[float32-rod that can not reach]": (
-        "a closed loop whose rows contradict each other (a rod 1.6 m longer than the linkage can reach) gains speed without "
-        "bound and is NaN after 34 steps of 1/240 s; Flag.NON_FINITE is set. Loops whose rows agree stay finite and closed"
-    ),
     **{
         f"tests/physics/test_soft_step.py::test_slab_that_sticks_does_not_creep[{precision}]": "no creep, but a start from "
         "nothing: at 40 degrees the slab slides 0.144 mm in the first step and no further in 3 s, gate 0.1 mm"
@@ -30,13 +26,6 @@ SHORTFALLS: dict[str, str] = {
         "0.5 m, gate 0"
         for precision in ("float32", "float64")
     },
-    **{
-        f"tests/physics/test_neutral.py::test_zero_friction_equals_no_friction[{precision}]": "contacts with friction "
-        "over-relax, those without do not: the sweeps part before they have converged"
-        for precision in ("float32", "float64")
-    },
-    "tests/physics/test_soft_step.py::test_sleep_fast_bodies_and_a_step_of_no_time": "the damping of a whole step is that "
-    "of its start: a ball stopped from 180 m/s leaves the wall at 0.022 m/s and is 21 mm away after a second, gate 10 mm",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.5 % is lost in 10 s: mean squared error 2.3e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps",
