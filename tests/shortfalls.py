@@ -32,6 +32,23 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 21 with the default solver, none with the converged one",
+    **{
+        f"tests/stability/test_scale.py::test_penetration_scales_with_size[float32-cards-{kind}]": "two cards that lean on "
+        f"each other: the deepest overlap, relative to their size, differs between scales by up to {times} times, not "
+        "explained yet; a stack of five cubes is the same within 2e-4 from 0.1 mm to 10 km"
+        for kind, times in (("dt unchanged, gravity scaled", 40), ("gravity unchanged, dt scaled", 24))
+    },
+    **{
+        f"tests/stability/test_fuzz.py::test_a_million_steps_of_random_worlds[{case}]": f"{gain} of the energy is gained, "
+        "gate 0.1 (measured while bouncing contacts still over-relaxed). The world of the closed forms gains none without "
+        "restitution: rebounds of several contacts at once can take more than the impacts had. No world is NaN or flagged"
+        for case, gain in (
+            ("float32-free-closed forms-0.016666666666666666", "0.15"),
+            ("float64-free-closed forms-0.016666666666666666", "0.15"),
+            ("float32-free-iterative-0.016666666666666666", "0.18 to 0.90"),
+            ("float32-free-iterative-0.004166666666666667", "0.19 to 1.18"),
+        )
+    },
     "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
     "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
     "its centre ends up to 77 mm in the ground",
