@@ -49,6 +49,12 @@ SHORTFALLS: dict[str, str] = {
             ("float32-free-iterative-0.004166666666666667", "0.19 to 1.18"),
         )
     },
+    **{
+        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "finite, but two boxes "
+        f"with a pendulum on the upper, at rest, gain {gain} times their energy in steps of 100 s, 640 times in 10 s "
+        "and 4 % in 0.1 s (float64), gate 1 %; none in steps of 1e-12 to 1e-3 s and of 1 s"
+        for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
+    },
     "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
     "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
     "its centre ends up to 77 mm in the ground",

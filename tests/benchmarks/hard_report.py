@@ -29,8 +29,8 @@ tested in `tests/physics/test_hard_scenes.py`. Peers: published figures (SimBenc
 measurements with PyBullet and MuJoCo, for the same measurement.
 
 Scenes that are held or not are tests alone: cached impulses (B9) `tests/physics/test_warm_start.py`, tunnelling (B12)
-`test_fast_bodies.py`, far away, tiny and huge (B13) `tests/stability/test_scale.py`, broken worlds (B15)
-`tests/unit/test_flags.py`, random worlds `tests/stability/test_fuzz.py`.
+`test_fast_bodies.py`, far away, tiny and huge (B13) `tests/stability/test_scale.py`, bad worlds and time
+steps (B15) `test_bad_worlds.py`, random worlds `test_fuzz.py`.
 """
 
 
