@@ -34,7 +34,8 @@ class Options:
       slop: penetration that is left alone, as a fraction of the smaller body's inner radius. Guide 10.2 says 0.005; ten
         boxes then settle by 1.6 mm, with the default by 0.1 mm, and rest just as quietly.
       position_percent: share of the position error corrected in a step. Guide 10.3.
-      baumgarte: share of a joint's position error turned into velocity in a step. Guide 9.5.
+      baumgarte: share of a joint's position error turned into velocity in a step, where `position_iterations` is 0 and so
+        nothing else closes joints. It adds energy, and without bound where joints contradict each other. Guide 9.5.
       warm_start: start the solver from the impulses of the previous step. Guide 7.3 and 12.4.
       broadphase: "auto": in scenes of up to 20 possible pairs, and for planes, heightfields and polyhedra, each pair has its
         own contact slots; the others are found in every step by the method that suits the size of the scene. "none": every

@@ -136,8 +136,9 @@ def small_steps(
     count = options.substep_count
     start = tuple(impulse / count for impulse in start)
     rebound_sweeps = options.velocity_iterations if scene.restitution and problem.contact_rows else 0
+    damping = (options.linear_damping, options.angular_damping)
     added, gained, (total, last) = soft_step.solve(
-        count, rebound_sweeps, rows, problem.errors, begin, free, start, model.dt
+        count, rebound_sweeps, rows, problem.errors, begin, free, start, model.dt, damping
     )
     return free + added, gained, total, last
 

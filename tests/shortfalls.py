@@ -8,10 +8,6 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_mechanism_steps.py::test_a_loop_with_too_many_joints_stays_finite[float32-rod that can not reach]": (
-        "a closed loop whose rows contradict each other (a rod 1.6 m longer than the linkage can reach) gains speed without "
-        "bound and is NaN after 34 steps of 1/240 s; Flag.NON_FINITE is set. Loops whose rows agree stay finite and closed"
-    ),
     **{
         f"tests/physics/test_soft_step.py::test_slab_that_sticks_does_not_creep[{precision}]": "no creep, but a start from "
         "nothing: at 40 degrees the slab slides 0.144 mm in the first step and no further in 3 s, gate 0.1 mm"
@@ -30,19 +26,35 @@ SHORTFALLS: dict[str, str] = {
         "0.5 m, gate 0"
         for precision in ("float32", "float64")
     },
-    **{
-        f"tests/physics/test_neutral.py::test_zero_friction_equals_no_friction[{precision}]": "contacts with friction "
-        "over-relax, those without do not: the sweeps part before they have converged"
-        for precision in ("float32", "float64")
-    },
-    "tests/physics/test_soft_step.py::test_sleep_fast_bodies_and_a_step_of_no_time": "the damping of a whole step is that "
-    "of its start: a ball stopped from 180 m/s leaves the wall at 0.022 m/s and is 21 mm away after a second, gate 10 mm",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.5 % is lost in 10 s: mean squared error 2.3e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps",
     "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 21 with the default solver, none with the converged one",
+    **{
+        f"tests/stability/test_scale.py::test_penetration_scales_with_size[float32-cards-{kind}]": "two cards that lean on "
+        f"each other fall at scales 1e-4 and 1e-3 (1e-16 and 1e-13 kg), overlapping {times} times as much; else, and in "
+        "float64 at all scales, they stand with the same overlap to 1e-4. Not explained yet"
+        for kind, times in (("dt unchanged, gravity scaled", 40), ("gravity unchanged, dt scaled", 24))
+    },
+    **{
+        f"tests/stability/test_fuzz.py::test_a_million_steps_of_random_worlds[{case}]": f"{gain} of the energy is gained, "
+        "gate 0.1 (measured while bouncing contacts still over-relaxed). The world of the closed forms gains none without "
+        "restitution: rebounds of several contacts at once can take more than the impacts had. No world is NaN or flagged"
+        for case, gain in (
+            ("float32-free-closed forms-0.016666666666666666", "0.15"),
+            ("float64-free-closed forms-0.016666666666666666", "0.15"),
+            ("float32-free-iterative-0.016666666666666666", "0.18 to 0.90"),
+            ("float32-free-iterative-0.004166666666666667", "0.19 to 1.18"),
+        )
+    },
+    **{
+        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "finite, but two boxes "
+        f"with a pendulum on the upper, at rest, gain {gain} times their energy in steps of 100 s, 640 times in 10 s "
+        "and 4 % in 0.1 s (float64), gate 1 %; none in steps of 1e-12 to 1e-3 s and of 1 s"
+        for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
+    },
     "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
     "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
     "its centre ends up to 77 mm in the ground",

@@ -34,7 +34,7 @@ from mathota_jax.constraints.effective_mass import entries_of, normal_bound, tan
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver.laws import Bounded, Cone
+from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.row_matrix import Points
 from mathota_jax.solver.rows import Places, Rows, matrix_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
@@ -248,10 +248,10 @@ def rows_one_by_one(
     return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
 
 
-def _push_only(effective_mass: Array) -> Bounded:
+def _push_only(effective_mass: Array) -> Push:
     zero = jnp.zeros((1,) * effective_mass.ndim, effective_mass.dtype)
     shape = (effective_mass.shape[0], 1, 1, 1)
-    return Bounded(
+    return Push(
         effective_mass,
         jnp.broadcast_to(zero, shape),
         jnp.broadcast_to(zero, shape),

@@ -14,7 +14,7 @@ from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sid
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
-from mathota_jax.constraints.mechanism_layout import bounded_slots, layout
+from mathota_jax.constraints.mechanism_layout import bounded_slots
 from mathota_jax.constraints.mechanism_rows import Responses, own_mass
 from mathota_jax.constraints.row_coefficients import Coefficients
 from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
@@ -55,11 +55,11 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
     slots = np.maximum(table.order, 0)
     laws, curved, angular = (values[slots] for values in (motion.start.laws, motion.start.curved, motion.start.angular))
     error, rate, coefficients = select(table, (motion.start.error, motion.start.rate, motion.coefficients))
-    if (mechanisms := layout(scene)) is not None and scene.options.position_iterations:
-        # They are closed at the end of each step; an error turned into velocity would whip a chain that starts open.
-        error = jnp.where(np.isin(slots, mechanisms.slots)[:, None], 0.0, error)
     felt = mass if motion.responses is None else _with_trees(scene, slots, mass, motion.responses)
-    columns = Columns(felt, error, rate, angular[:, None], coefficients, model.dt, scene.options.baumgarte)
+    # An error turned into velocity whips a chain that starts open, and feeds a loop that can not close without bound. The
+    # position correction takes it back without energy.
+    baumgarte = 0.0 if scene.options.position_iterations else scene.options.baumgarte
+    columns = Columns(felt, error, rate, angular[:, None], coefficients, model.dt, baumgarte)
     found = {law: LAWS[law](columns) for law in sorted(set(laws.tolist()))}
 
     def of_each(name: str) -> Any:

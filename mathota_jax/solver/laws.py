@@ -34,16 +34,22 @@ class Bounded:
     upper: Array
 
     def relaxed(self, factor: Array) -> Bounded:
-        """The same law, whatever the factor.
-
-        Joints that overshoot were measured to feed a swinging arm with energy, elastic boxes without friction to spin.
-        """
+        """The same law, whatever the factor: joints that overshoot were measured to feed a swinging arm with energy."""
         return self
 
     def update(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
         free = impulse - (error + self.softness * impulse) * self.effective_mass
         return jnp.clip(free, self.lower, self.upper)
+
+
+@pytree
+class Push(Bounded):
+    """Contact without friction."""
+
+    def relaxed(self, factor: Array) -> Push:
+        """The same law with longer steps, which do not move its fixed point; `factor` (column, world)."""
+        return dataclasses.replace(self, effective_mass=self.effective_mass * factor)
 
 
 @pytree
@@ -64,7 +70,7 @@ class Cone:
     friction: Array
 
     def relaxed(self, factor: Array) -> Cone:
-        """The same law with longer steps of the normal row, which do not move its fixed point.
+        """The same law with longer steps of the normal row, which do not move its fixed point; `factor` (column, world).
 
         The tangents keep theirs: friction that overshoots while its limit changes was measured to keep bodies creeping.
         """

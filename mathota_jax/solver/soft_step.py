@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from mathota_jax.solver import pgs
@@ -159,6 +160,7 @@ def solve(
     free: Array,
     impulses: tuple[Array, ...],
     dt: Array,
+    damping: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Array, Array, Impulses]:
     """Runs the substeps of one step. Derivatives are those of the map itself, through every sweep.
 
@@ -171,6 +173,7 @@ def solve(
       free: the same at its end if nothing constrained it.
       impulses: for each group (turn, row, column, world), those of one substep to start from.
       dt: length of the step.
+      damping: rates [1/s] at which linear and angular velocities decay, in `free` already.
 
     Returns:
       What the impulses add to the velocity at the end of the step and to the displacement (component, block, world), and
@@ -190,10 +193,13 @@ def solve(
         for group, error in zip(rows, errors, strict=True)
     )
 
+    decay = _decay(damping, 0.5 * length, velocity)
+
     def substep(carry: tuple, number: Array) -> tuple[tuple, None]:
         """Carries what the impulses added to velocity and displacement: free bodies keep to their path exactly."""
         velocity, change, displacement, impulses, total, _ = carry
-        start, half = velocity, 0.5 * change
+        velocity, half = velocity * decay, 0.5 * change
+        start = velocity * decay
         time, middle, end = number * length, (number + 0.5) * length, (number + 1.0) * length
         halves = tuple(0.5 * impulse for impulse in impulses)
         lasting = tuple(impulse[:, 0] > 0 for impulse in impulses)
@@ -207,6 +213,7 @@ def solve(
         )
         velocity, impulses = _sweep(1, rows, laws, biases, velocity + half, halves)
         displacement = displacement + length * velocity
+        velocity = velocity * decay
         impulses = tuple(first + second for first, second in zip(impulses, halves, strict=True))
         laws = tuple(
             _rigid_law(group, impulse[:, :1] > 0, before)
@@ -229,6 +236,17 @@ def solve(
         return velocity, displacement, Impulses(total, impulses)
     biases = _end_biases(groups, wanted, dt, dt)
     return _rebound(rebound_sweeps, groups, biases, velocity, displacement, impulses, total)
+
+
+def _decay(damping: tuple[float, float], time: Array, velocity: Array) -> Array | float:
+    """Factor (component, 1, world) or 1 on what the impulses added to the velocity.
+
+    `velocity` without them is damped as if they were not there: a body stopped from 180 m/s would leave again.
+    """
+    if not any(damping):
+        return 1.0
+    rates = np.repeat(damping, 3)[: len(velocity), None, None]
+    return jnp.maximum(1.0 - jnp.asarray(rates, velocity.dtype) * time, 0.0)
 
 
 class _Group(NamedTuple):
@@ -293,7 +311,7 @@ def _sweep(
     velocity: Array,
     impulses: tuple[Array, ...],
 ) -> tuple[Array, tuple[Array, ...]]:
-    def update(_: Array | int, law: Any, impulse: Array, error: Array) -> Array:
+    def update(_: Array | int, law: Any, __: Array, impulse: Array, error: Array) -> Array:
         return law.update(impulse, error)
 
     return pgs.sweeps(count, rows, update, laws, biases, velocity, impulses)

@@ -27,6 +27,10 @@ a dash was not timed. Written by `python -m tests.benchmarks.hard_report`; the s
 `tests/benchmarks/hard_scenes.py`, settings, gates and measurements in `hard_cases.py`, and what is to carry a scene is
 tested in `tests/physics/test_hard_scenes.py`. Peers: published figures (SimBenchmark, Solver2D, ContactBench) and own
 measurements with PyBullet and MuJoCo, for the same measurement.
+
+Scenes that are held or not are tests alone: cached impulses (B9) `tests/physics/test_warm_start.py`, tunnelling (B12)
+`test_fast_bodies.py`, far away, tiny and huge (B13) `tests/stability/test_scale.py`, bad worlds and time
+steps (B15) `test_bad_worlds.py`, random worlds `test_fuzz.py`.
 """
 
 

@@ -25,7 +25,7 @@ def test_unrolled_sweeps_have_the_implicit_derivative(float64, friction, gate):
 
     def unrolled(count):
         def run(velocity):
-            return pgs.sweeps(count, rows, lambda _, law, x, e: law.update(x, e), laws, biases, velocity, start)[0]
+            return pgs.sweeps(count, rows, lambda _, law, __, x, e: law.update(x, e), laws, biases, velocity, start)[0]
 
         return run
 

@@ -1,0 +1,117 @@
+"""One world of eight is given what can not be, or a time step out of all proportion (benchmark B15).
+
+What a builder refuses is in `test_builder_errors`, overflow of capacities in `test_broadphase` and `test_many_bodies`,
+identical and contradicting joints in `test_mechanism_steps`.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mathota_jax import Box, Flag, Hinge, Plane, SceneBuilder, energy
+from tests.scenes import DOWN, advance_worlds, repeat, undamped
+
+WORLDS, BAD = 8, 3
+HEALTHY = np.arange(WORLDS) != BAD
+
+
+@functools.cache
+def scene(x64):
+    """Two boxes at rest on each other, and one that swings from the upper of them; `x64` belongs to the key."""
+    del x64
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, restitution=0.5)
+    for level in range(2):
+        builder.add_body(Box((0.5, 0.5, 0.5)), mass=10.0, position=(0, 0.5 + level, 0), restitution=0.5)
+    arm = builder.add_body(Box((0.1, 0.3, 0.1)), mass=1.0, position=(0.0, 1.2, 0.8))
+    builder.add_joint(Hinge(2, arm, (0, 1.5, 0.8), (0, 0, 1), limits=(-1.0, 1.0)))
+    return builder.build(undamped(dt=1 / 60))
+
+
+def batch():
+    model, state = scene(jax.config.jax_enable_x64)
+    states = repeat(state, WORLDS)
+    push = jnp.linspace(0.1, 2.0, WORLDS)
+    return repeat(model, WORLDS), dataclasses.replace(states, velocity=states.velocity.at[:, 3, 0].set(push))
+
+
+def of_state(field, entry, value):
+    def change(models, states):
+        leaf = getattr(states, field)
+        return models, dataclasses.replace(states, **{field: leaf.at[(BAD, *entry)].set(value)})
+
+    return change
+
+
+def of_model(field, value, *entry):
+    def change(models, states):
+        leaf = getattr(models, field)
+        return dataclasses.replace(models, **{field: leaf.at[(BAD, *entry)].set(value)}), states
+
+    return change
+
+
+def no_size(models, states):
+    shapes = {
+        kind: {name: leaf.at[BAD].set(0.0) for name, leaf in leaves.items()} if kind == "box" else leaves
+        for kind, leaves in models.shapes.items()
+    }
+    return dataclasses.replace(models, shapes=shapes, size=models.size.at[BAD, 1:].set(0.0)), states
+
+
+BAD_WORLDS = {
+    "position NaN": of_state("position", (1, 0), jnp.nan),
+    "velocity infinite": of_state("velocity", (2, 1), jnp.inf),
+    "orientation 0": of_state("orientation", (1,), 0.0),
+    "mass 0": of_model("mass", 0.0, 1),
+    "mass negative": of_model("mass", -1.0, 1),
+    "mass NaN": of_model("mass", jnp.nan, 1),
+    "inertia 0": of_model("inertia", 0.0, 1),
+    "size 0": no_size,
+    "friction -1": of_model("friction", -1.0),
+    "restitution 2": of_model("restitution", 2.0),
+    "gravity infinite": of_model("gravity", jnp.inf),
+    "dt 0": of_model("dt", 0.0),
+    "dt 1e-12": of_model("dt", 1e-12),
+    "dt 1": of_model("dt", 1.0),
+    "dt 100": of_model("dt", 100.0),
+    "dt -1/60": of_model("dt", -1 / 60),
+    "dt NaN": of_model("dt", jnp.nan),
+}
+
+
+def finite(states):
+    """Whether each world is."""
+    leaves = [states.position, states.orientation, states.velocity, states.angular_velocity]
+    return np.all([np.isfinite(leaf).all((1, 2)) for leaf in leaves], axis=0)
+
+
+def test_a_bad_world_leaves_the_others_alone(precision):
+    """The other seven are the same to the bit; the bad one is finite or flagged."""
+    models, states = batch()
+    clean = advance_worlds(models, states, 20)
+    assert finite(clean).all() and not np.asarray(clean.flags).any()
+    for name, change in BAD_WORLDS.items():
+        mixed = advance_worlds(*change(models, states), 20)
+        for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(clean), jax.tree.leaves(mixed), strict=True):
+            where = f"{name}: {jax.tree_util.keystr(path)}"
+            np.testing.assert_array_equal(np.asarray(a)[HEALTHY], np.asarray(b)[HEALTHY], err_msg=where)
+        flagged = bool(np.asarray(mixed.flags)[BAD] & Flag.NON_FINITE)
+        assert flagged or finite(mixed)[BAD], f"{name}: not finite, and not flagged"
+
+
+def test_time_steps_out_of_all_proportion(precision, gate):
+    """Steps of 1e-12 s to 100 s: finite; boxes at rest stay there, and nothing gains energy."""
+    models, states = batch()
+    states = dataclasses.replace(states, velocity=jnp.zeros_like(states.velocity))
+    times = np.array([1e-12, 1e-6, 1e-3, 1 / 60, 0.1, 1.0, 10.0, 100.0])
+    models = dataclasses.replace(models, dt=jnp.asarray(times, models.dt.dtype))
+    before = np.asarray(jax.vmap(energy)(models, states), float)
+    final = advance_worlds(models, states, 20)
+    assert finite(final).all()
+    rise = np.asarray(jax.vmap(energy)(models, final), float) - before
+    # 10 kg and 10 kg lifted by their height.
+    gate("energy gained / that of the boxes", np.maximum(rise, 0.0) / (2 * 10 * 9.81), 0.01)
