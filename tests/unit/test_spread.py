@@ -3,9 +3,10 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 
-from mathota_jax.spatial.spread import add_slices, spread
+from mathota_jax.spatial.spread import FEW_SLICES, add_all_slices, add_slices, largest_slice, spread
 
 
 def product(matrix, vector):
@@ -39,3 +40,11 @@ def test_transposes_have_no_reduction(float64):
     cotangents = str(jax.make_jaxpr(lambda m, v, c: jax.vjp(product, m, v)[1](c))(matrix, vector, jnp.ones((2, 3, 5))))
     assert "reduce_sum" not in cotangents
     assert "add_slices" in cotangents
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 5), (2, 3, 4, 5), (FEW_SLICES, 2, 5)], ids=["one", "few", "many"])
+def test_sum_and_maximum_over_all_but_the_worlds(float64, shape):
+    values = jnp.asarray(np.random.default_rng(0).normal(size=shape))
+    every_axis = tuple(range(len(shape) - 1))
+    np.testing.assert_allclose(add_all_slices(values), np.asarray(values).sum(every_axis), rtol=1e-13)
+    np.testing.assert_array_equal(largest_slice(values), np.asarray(values).max(every_axis))
