@@ -11,6 +11,7 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_slices
 from mathota_jax.spatial.vector import Vec3
 
@@ -76,12 +77,14 @@ def plausible(rows: tuple[Rows, ...], inertia: Inertia, velocity: Array, start: 
     slope = _total(velocity * momentum)
     for group, impulse in zip(rows, start, strict=True):
         slope = slope + _total(add_slices(group.bias * impulse, 1))
-    curvature = _total(change * momentum)
+    # Stored: every impulse needs their sum over all bodies.
+    slope, curvature = compute_once((slope, _total(change * momentum)), velocity)
     worse = slope + 0.5 * curvature > 0
     scale = jnp.where(worse, jnp.clip(safe_divide(-slope, curvature), 0.0, 1.0), 1.0)
     return tuple(lax.stop_gradient(impulse * scale) for impulse in start)  # the start does not move the solution
 
 
 def _total(terms: Array) -> Array:
-    """Sum (world,) of (many, few, world): what XLA would make of both axes at once is a scalar loop."""
-    return add_slices(terms, 1).sum(0)
+    """Sum (world,) of (..., ..., world): what XLA would make of both axes at once is a scalar loop."""
+    shorter = 0 if terms.shape[0] < terms.shape[1] else 1
+    return add_slices(terms, shorter).sum(0)
