@@ -317,13 +317,18 @@ def _linear_sweeps(
     def relaxed(of_turn: object, bias: Array, impulse: Array, error: Array) -> Array:
         return impulse + factors.astype(error.dtype) * (update(of_turn, bias, impulse, error) - impulse)
 
-    def sweep(_: Array, carry: tuple) -> tuple:
-        now, before = carry
+    def sweep(now: tuple, before: tuple) -> tuple:
         new = _sweep_all(rows, relaxed, coefficients, zeros, *now)
-        return jax.tree.map(lambda x, a, b: x + MOMENTUM * (a - b), new, now, before), now
+        return jax.tree.map(lambda x, a, b: x + MOMENTUM * (a - b), new, now, before)
+
+    def two_sweeps(_: Array, carry: tuple) -> tuple:
+        # Each sweep takes the place of the one before the last: a loop of single ones would copy both.
+        now, before = carry
+        before = sweep(now, before)
+        return sweep(before, now), before
 
     start = (nothing, zeros)
-    return lax.fori_loop(0, iterations, sweep, (start, start))[0][1]
+    return lax.fori_loop(0, -(-iterations // 2), two_sweeps, (start, start))[0][1]
 
 
 def _accelerate(rows: tuple[Rows, ...]) -> bool:

@@ -1,4 +1,4 @@
-"""`spread` and `add_slices`: a broadcast and a sum along short axes, each the transpose of the other; `largest_slice`.
+"""`spread` and `add_slices`: a broadcast and a sum along short axes, each the transpose of the other; extremes too.
 
 The transpose of an ordinary broadcast is a reduction, which XLA on CPUs computes by a library call or a scalar loop: for
 the few rows and components of a constraint that takes longer than everything around it. A sum of slices is fused with
@@ -50,8 +50,12 @@ def add_all_slices(array: Array) -> Array:
 
 def largest_slice(array: Array) -> Array:
     """Maximum (world,) along all axes but the last."""
-    slices = array.reshape(-1, array.shape[-1])
-    return functools.reduce(jnp.maximum, unstack(slices, 0)) if len(slices) <= FEW_SLICES else slices.max(0)
+    return largest_row(array.reshape(-1, array.shape[-1]))
+
+
+def largest_row(array: Array) -> Array:
+    """Maximum along the first axis, which is removed. Store what is computed: XLA may compute it again for each row."""
+    return functools.reduce(jnp.maximum, unstack(array, 0)) if len(array) <= FEW_SLICES else array.max(0)
 
 
 def _broadcast(array: Array, *, shape: tuple[int, ...]) -> Array:

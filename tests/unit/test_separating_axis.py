@@ -42,7 +42,7 @@ def test_depth_of_overlapping_cores_against_the_oracle(pair, precision):
     separation = np.asarray(found.separation * scale)[0]
     assert np.isfinite(separation).all()
     compared = 0
-    for index in np.flatnonzero(wanted)[::30]:
+    for index in np.flatnonzero(wanted)[::10]:
         truth, _ = oracle(Placed(pair, scene, index))
         if truth < -1e-6:
             assert separation[index] == pytest.approx(truth, abs=2e-6 if precision == np.float32 else 1e-9)

@@ -19,11 +19,12 @@ from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.difference import Difference
 from mathota_jax.collision.convex.polytope import Edges, Polytope, row_count
 from mathota_jax.spatial.indexing import unstack
-from mathota_jax.spatial.settle import compute_once, settle_code
+from mathota_jax.spatial.settle import compute_once, materialize, settle_code, store
+from mathota_jax.spatial.spread import largest_row
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, where
 
-EDGES = 256 * 42
-"""Edges of B in all pairs that are tested at a time: they fit into the cache of a core (42: of 16 corners)."""
+EDGES = 64 * 30
+"""Edges of B in all pairs that are tested at a time: they stay in the cache beside the core (30: of 12 corners)."""
 ARC_ROUNDING = 8.0
 """Arcs must cross by this many round-offs. A crossing within less of an end is no deeper than the face there, to the same
 round-off of the size, while its direction may be noise."""
@@ -64,39 +65,49 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
 
 def _best_of_some(wanted: Array, lanes: int, placed: _Placed) -> Axis:
     """`_best` of the pairs that are wanted, `lanes` at a time."""
-    flat = jax.tree.map(lambda x: _flatten(x, wanted.shape), placed)
-    order = jnp.argsort(~wanted.reshape(-1), stable=True)
-    count = jnp.sum(wanted, dtype=jnp.int32)
+    place = jnp.cumsum(wanted.reshape(-1), dtype=jnp.int32)
+    count = place[-1]
+    order = jnp.zeros(wanted.size, jnp.int32)
+    order = order.at[jnp.where(wanted.reshape(-1), place - 1, wanted.size)].set(jnp.arange(wanted.size), mode="drop")
+    by_pair, by_lane = _tables(placed, wanted.shape)
 
     def test_some(state: tuple[Array, Array]) -> tuple[Array, Array]:
         turn, found = state
         chosen = lax.dynamic_slice_in_dim(order, turn * lanes, lanes)
-        axis = _best(_take_lanes(flat, chosen))
-        return turn + 1, found.at[:, 0, chosen].set(jnp.stack([*axis.direction, axis.separation])[:, 0])
+        leaves = jax.tree.leaves(placed)
+        for tables, index in ((by_pair, chosen // wanted.shape[1]), (by_lane, chosen)):
+            for places, table in tables:
+                some = jnp.take(table, index, axis=-1)
+                for at, leaf in zip(places, unstack(some, 0), strict=True):
+                    leaves[at] = leaf[..., None, :]
+        axis = materialize(_best(jax.tree.unflatten(jax.tree.structure(placed), leaves)))
+        return turn + 1, found.at[:, chosen].set(jnp.stack([*axis.direction, axis.separation])[:, 0])
 
-    state = jnp.zeros((), jnp.int32), jnp.zeros((4, 1, wanted.size), placed.position.x.dtype)
+    state = jnp.zeros((), jnp.int32), jnp.zeros((4, wanted.size), placed.position.x.dtype)
     _, found = lax.while_loop(lambda s: s[0] * lanes < count, test_some, state)
     x, y, z, separation = (row.reshape(wanted.shape) for row in unstack(found, 0))
     return Axis(Vec3(x, y, z), separation)
 
 
-def _take_lanes(tree: _Placed, chosen: Array) -> _Placed:
-    """Some lanes of every array; arrays of one shape by one gather. What all share stays as it is."""
-    leaves, structure = jax.tree.flatten(tree)
-    taken = list(leaves)
-    for shape in {leaf.shape for leaf in leaves if leaf.shape[-1] > 1}:
-        places = [place for place, leaf in enumerate(leaves) if leaf.shape == shape]
-        some = jnp.take(jnp.stack([leaves[place] for place in places]), chosen, axis=-1)
-        for place, leaf in zip(places, unstack(some, 0), strict=True):
-            taken[place] = leaf
-    return jax.tree.unflatten(structure, taken)
+_Tables = list[tuple[list[int], Array]]
 
 
-def _flatten(values: Array, lanes: tuple[int, ...]) -> Array:
-    """(..., pair, world) as (..., 1, lane); what all share stays as it is."""
-    if values.shape[-2:] == (1, 1):
-        return values
-    return jnp.broadcast_to(values, (*values.shape[:-2], *lanes)).reshape(*values.shape[:-2], 1, -1)
+def _tables(placed: _Placed, shape: tuple[int, ...]) -> tuple[_Tables, _Tables]:
+    """Leaves of one shape stacked, and their numbers: (leaf, ..., pair), and (leaf, ..., lane) where worlds differ.
+
+    What all pairs share is in no table.
+    """
+    leaves = jax.tree.leaves(placed)
+    by_pair, by_lane = [], []
+    for size in dict.fromkeys(leaf.shape for leaf in leaves if leaf.shape[-2:] != (1, 1)):
+        places = [place for place, leaf in enumerate(leaves) if leaf.shape == size]
+        stacked = jnp.stack([leaves[place] for place in places])
+        if size[-1] == 1:
+            by_pair.append((places, stacked[..., 0]))
+        else:
+            stacked = jnp.broadcast_to(stacked, (*stacked.shape[:-2], *shape))
+            by_lane.append((places, stacked.reshape(*stacked.shape[:-2], -1)))
+    return by_pair, by_lane
 
 
 def _best(placed: _Placed) -> Axis:
@@ -122,7 +133,9 @@ def _best(placed: _Placed) -> Axis:
 
 def _support(vertices: Vec3, directions: Vec3) -> Array:
     """Largest height of the vertices along each direction (row, pair, world)."""
-    return jnp.max(dot(vertices.map(lambda c: c[:, None]), directions.map(lambda c: c[None])), axis=0)
+    corners = zip(*(unstack(component, 0) for component in vertices), strict=True)
+    largest = functools.reduce(jnp.maximum, [dot(Vec3(*corner), directions) for corner in corners])
+    return store(largest, largest)
 
 
 def _packed(edges: Edges) -> Vec3:
@@ -144,7 +157,9 @@ def _best_crossing(a: Vec3, b: Vec3, position: Vec3) -> Axis:
     """
 
     def of_edge(_: None, edge: Vec3) -> tuple[None, Array]:
-        return None, jnp.max(_crossing(edge, b, position)[1], axis=0)
+        # Stored: a kernel that slices by the counter of the loop is not vectorised.
+        score = _crossing(compute_once(edge, position.x), b, position)[1]
+        return None, largest_row(compute_once(score, score))
 
     _, scores = lax.scan(of_edge, None, a)
     _, chosen = best_candidate(scores)
