@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +14,7 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints import compact, contact, joint_layout
+from mathota_jax.constraints import compact, contact, joint_layout, loops
 from mathota_jax.constraints.assembly import collect
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
@@ -60,13 +61,16 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
     """Mean forces over the step and what they belong to, in the form in which the state keeps them; new flags."""
     scene = model.scene
     changes = _mean_forces(scene, problem, impulses, model.dt)
+    flags: list[Array] = []
+    if problem.joints is not None and (open_loops := loops.are_open(model, problem.joints)) is not None:
+        flags.append(jnp.where(open_loops, int(Flag.OPEN_LOOP), 0))
     if problem.contacts is not None:
         changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
         if problem.contacts.converged is not None or problem.close is not None:
-            changes["flags"] = _collision_flags(problem.contacts, problem.close)
+            flags.append(_collision_flags(problem.contacts, problem.close))
         if problem.close is not None:
             changes["contact_pair"] = compact.pair_keys(scene, problem.close)
-    return changes
+    return {**changes, "flags": functools.reduce(jnp.bitwise_or, flags)} if flags else changes
 
 
 def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tuple[Array, ...]) -> EndForces:

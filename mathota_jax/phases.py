@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
-from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, mechanism_rows, motor
+from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, mechanism_rows, motor, rebound_limit
 from mathota_jax.constraints.mechanism_layout import bounded_slots, covers, covers_with_bounds, layout
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.dynamics import events, sleep
@@ -75,7 +75,12 @@ def solve_rows(
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
     if problem.held is None:
-        return _sweep(scene, rows, velocity, start, known)
+        solved, impulses, failed = _sweep(scene, rows, velocity, start, known)
+        if scene.rebounds_together and not known:
+            again = functools.partial(_impulses, scene, velocity, start)
+            contacts = tuple(problem.contact_rows)
+            solved, impulses = rebound_limit.limit(again, problem.joint_rows, contacts, velocity, solved, impulses)
+        return solved, impulses, failed
     return _solve_mechanisms(scene, problem, problem.held, velocity, start)
 
 
@@ -108,6 +113,10 @@ def _solve_mechanisms(
     joints = tuple(old + more for old, more in zip(joints, change, strict=True))
     _, joints = hold(add_impulses(problem.joint_rows, velocity, change), joints)
     return moved, (*joints, *others), failed
+
+
+def _impulses(scene: Scene, velocity: Array, start: tuple[Array, ...], rows: tuple[Rows, ...]) -> tuple[Array, ...]:
+    return _sweep(scene, rows, velocity, start, known=False)[1]
 
 
 def _sweep(

@@ -183,6 +183,12 @@ class Scene:
         """Number of contact slots: those that belong to a pair, then those of the compact groups."""
         return self.static_slot_count + sum(group.slot_count for group in self.compact_groups)
 
+    @functools.cached_property
+    def rebounds_together(self) -> bool:
+        """Whether anything bounces where more than one pair of bodies can meet at once."""
+        pairs = sum(len(group.bodies_a) for group in self.pair_groups)
+        return self.restitution and (pairs > 1 or bool(self.compact_groups))
+
     @property
     def place_count(self) -> int:
         """Number of pairs that the compact groups hold."""

@@ -30,6 +30,10 @@ class Flag(enum.IntFlag):
     INVALID_TIME_STEP = 16
     """A step was asked for with a negative or not finite `Model.dt`, or an elapsed time; nothing was done."""
 
+    OPEN_LOOP = 32
+    """A joint of a closed loop was open by a tenth of the arms of its bodies, or by 0.1 rad, at the start of a step: the
+    joints contradict each other, the solver can not close them (more sweeps, smaller steps), or the state was given so."""
+
 
 @pytree
 class Sleep:

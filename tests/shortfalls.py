@@ -27,27 +27,17 @@ SHORTFALLS: dict[str, str] = {
         for precision in ("float32", "float64")
     },
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
-    "(1e-7), but 1.5 % is lost in 10 s: mean squared error 2.3e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
-    "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps",
+    "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
+    "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
+    "rebounds would gain energy all of that step are cut, which is 0.2 % of it",
     "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
-    "the converged solver's rest; 21 with the default solver, none with the converged one",
+    "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
         f"tests/stability/test_scale.py::test_penetration_scales_with_size[float32-cards-{kind}]": "two cards that lean on "
         f"each other fall at scales 1e-4 and 1e-3 (1e-16 and 1e-13 kg), overlapping {times} times as much; else, and in "
         "float64 at all scales, they stand with the same overlap to 1e-4. Not explained yet"
         for kind, times in (("dt unchanged, gravity scaled", 40), ("gravity unchanged, dt scaled", 24))
-    },
-    **{
-        f"tests/stability/test_fuzz.py::test_a_million_steps_of_random_worlds[{case}]": f"{gain} of the energy is gained, "
-        "gate 0.1 (measured while bouncing contacts still over-relaxed). The world of the closed forms gains none without "
-        "restitution: rebounds of several contacts at once can take more than the impacts had. No world is NaN or flagged"
-        for case, gain in (
-            ("float32-free-closed forms-0.016666666666666666", "0.15"),
-            ("float64-free-closed forms-0.016666666666666666", "0.15"),
-            ("float32-free-iterative-0.016666666666666666", "0.18 to 0.90"),
-            ("float32-free-iterative-0.004166666666666667", "0.19 to 1.18"),
-        )
     },
     **{
         f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "finite, but two boxes "

@@ -72,6 +72,8 @@ class ContactRows(NamedTuple):
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.
       size: (turn, 1, column, world) inner radius of the smaller moving body.
+      falling: (turn, row, column, world) change of each row's velocity by gravity during the lever; None where no rebounds
+        need a limit.
     """
 
     rows: Rows
@@ -80,6 +82,7 @@ class ContactRows(NamedTuple):
     separation: Array
     slop: Array
     size: Array
+    falling: Array | None = None
 
 
 class PlacedPairs(NamedTuple):
@@ -183,6 +186,10 @@ def contact_rows(
     )
     size = pack_scalars(table, [smaller_side(table, take(model.size, scene.dynamic_bodies), places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
+    falling = None
+    if scene.rebounds_together:
+        side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
+        falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
     return ContactRows(
         rows,
         pack_scalars(table, [lever], worlds),
@@ -190,6 +197,7 @@ def contact_rows(
         pack_scalars(table, [separation], worlds),
         scene.options.slop * size,
         size,
+        falling,
     )
 
 

@@ -12,6 +12,8 @@ from mathota_jax.constraints.joint_layout import JointGroup, joint_groups, joint
 from mathota_jax.scene import Scene
 from mathota_jax.solver.tree import GROUND, Tree
 
+_Slots = tuple[tuple[int, ...], tuple[int, ...]]
+
 LEAST_JOINTS = 3
 """Joints of the smallest mechanism: two converge in a few sweeps, which are cheaper."""
 
@@ -91,22 +93,26 @@ def layout(scene: Scene) -> Layout | None:
     # Between impacts bodies follow paths of constant force, which a closing of the joints would leave.
     if options.solver == "soft_step" or options.impact_events or not options.exact_joints:
         return None
-    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
-    held = {
-        joint: _held_slots(group, place) for group in joint_groups(scene) for place, joint in enumerate(group.joints)
-    }
-    ends = {
-        joint: tuple(block_of.get(body, GROUND) for body in (scene.joints[joint].parent, scene.joints[joint].child))
-        for joint, slots in held.items()
-        if any(slots)
-    }
+    held, ends = _held_joints(scene)
     links: list[Link] = []
-    for joints in _components(ends, len(block_of)):
+    for joints in _components(ends, len(scene.dynamic_bodies)):
         grounded = sum(GROUND in ends[joint] for joint in joints)
         bodies = {block for joint in joints for block in ends[joint]} - {GROUND}
         if len(joints) >= LEAST_JOINTS and grounded <= 1 and len(joints) == len(bodies) - 1 + grounded:
             _grow(links, joints, ends, held)
-    return Layout(tuple(links), len(block_of)) if links else None
+    return Layout(tuple(links), len(scene.dynamic_bodies)) if links else None
+
+
+@functools.cache
+def looped_slots(scene: Scene) -> tuple[tuple[int, int, bool], ...]:
+    """Joint, slot and whether it holds a rotation, of each row that always holds in a closed loop of joints."""
+    held, ends = _held_joints(scene)
+    found = []
+    for joints in _components(ends, len(scene.dynamic_bodies)):
+        nodes = {block for joint in joints for block in ends[joint]}  # the ground is one of them
+        if len(joints) >= len(nodes):
+            found += [(joint, slot, bool(part)) for joint in joints for part in range(2) for slot in held[joint][part]]
+    return tuple(found)
 
 
 def covers(scene: Scene) -> bool:
@@ -140,6 +146,16 @@ def bounded_slots(scene: Scene) -> tuple[int, ...]:
         <= links
     ]
     return tuple(sorted(set(slots) - set(found.slots)))
+
+
+def _held_joints(scene: Scene) -> tuple[dict[int, _Slots], dict[int, tuple[int, ...]]]:
+    """Of each joint that holds anything: its slots as in `_held_slots`, and its velocity blocks or `GROUND`."""
+    block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
+    groups = joint_groups(scene)
+    held = {joint: _held_slots(group, place) for group in groups for place, joint in enumerate(group.joints)}
+    held = {joint: slots for joint, slots in held.items() if any(slots)}
+    bodies = {joint: (scene.joints[joint].parent, scene.joints[joint].child) for joint in held}
+    return held, {joint: tuple(block_of.get(body, GROUND) for body in pair) for joint, pair in bodies.items()}
 
 
 def _held_slots(group: JointGroup, place: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import shlex
 from typing import NamedTuple
 
 import pytest
@@ -42,10 +43,11 @@ class Recorder:
 
 def table(recorder: Recorder, tests: str) -> str:
     """The report in Markdown."""
+    command = f"python -m tests.benchmarks.gate_report --tests {shlex.quote(tests)}"
     lines = [
-        f"# Gates of `{tests}`",
+        "# Gates",
         "",
-        f"Written by `python -m tests.benchmarks.gate_report --tests {tests}`. Errors as the tests measure them,",
+        f"Written by `{command}`. Errors as the tests measure them,",
         "largest of all worlds, beside what they may be. A test ends at the first gate that it misses; why, says",
         "`tests/shortfalls.py`.",
     ]

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Capsule, Hinge, Plane, SceneBuilder, Slider, Sphere, contacts, energy, rollout
+from mathota_jax.constraints.impact import Approach, impact
+from mathota_jax.spatial.vector import Vec3
 from tests.scenes import DOWN, stack, undamped
 
 HALF = 0.1  # every shape reaches this far below its centre
@@ -102,3 +104,15 @@ def check_every_gradient(kinds, restitution):
         finite = np.isfinite(np.asarray(leaf)).reshape(len(names), -1).all(axis=1)
         bad += [f"{name}: d / d {jax.tree_util.keystr(path)}" for name, ok in zip(names, finite, strict=True) if not ok]
     assert not bad, "not finite:\n" + "\n".join(bad)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-30, 1e-19, 1e-9, 1.0])
+def test_a_wide_gap_that_hardly_closes(speed):
+    """The time of an impact that does not come in this step has no derivative, and no infinite one times 0 either."""
+
+    def lever(start):
+        one = jnp.ones(1)
+        gravity = Vec3(0.0 * one, -9.81 * one, 0.0 * one)
+        return impact(Approach(20.0 * one, -start * one, -start * one, None, gravity), jnp.asarray(0.01))
+
+    assert np.isfinite(np.asarray(jax.jacrev(lambda start: jnp.stack(lever(start)))(speed))).all()

@@ -229,7 +229,10 @@ OVERCONSTRAINED = {
 )
 @pytest.mark.parametrize("precision", ["float32"], indirect=True)
 def test_a_loop_with_too_many_joints_stays_finite(precision, case, gate):
-    """Rows that say the same twice, or what can not be: nothing is NaN, and no energy comes from nothing."""
+    """Rows that say the same twice, or what can not be: nothing is NaN, and no energy comes from nothing.
+
+    What can not be is flagged.
+    """
     model, state = bars(*OVERCONSTRAINED[case])
     spin = state.angular_velocity.at[1, 2].set(-1.0)
     state = dataclasses.replace(state, angular_velocity=spin)
@@ -239,10 +242,12 @@ def test_a_loop_with_too_many_joints_stays_finite(precision, case, gate):
             "energy": energy(model, state), "gap": joint_gaps(model, state).translation, "flags": state.flags,
         },
     )  # fmt: skip
-    assert np.isfinite(record["energy"]).all() and not np.asarray(record["flags"]).any()
+    assert np.isfinite(record["energy"]).all()
+    contradicts = case == "rod that can not reach"
+    assert (np.asarray(record["flags"]) == (Flag.OPEN_LOOP if contradicts else 0)).all()
     rise = np.asarray(record["energy"], float) - float(energy(model, state))
     gate("energy gained / that of the fall", np.maximum(rise, 0.0) / (GRAVITY * 3 * 2.0), 0.02)
-    if case != "rod that can not reach":
+    if not contradicts:
         gate("gap [m]", np.asarray(record["gap"]), 1e-2)
 
 

@@ -1,0 +1,119 @@
+"""As much of the restitution of a step as gains no energy.
+
+Newton's restitution gives each contact its own rebound. With friction, with unequal coefficients, or where one impact
+presses on another contact, all rebounds together can take more energy than the impacts had (T. R. Kane, D. A. Levinson,
+"Dynamics: Theory and Applications", 1985). Without rebound an impact never gains any, and on the way from those impulses to
+the full ones the work is a parabola: a world that gains gets the share at which its contacts do no work.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.spread import add_all_slices
+
+Impulses = tuple[Array, ...]
+
+ROUND_OFF = 64
+"""Multiples of the machine epsilon, of the work that is done and undone, within which a gain is round-off."""
+
+
+def limit(
+    solve: Callable[[tuple[Rows, ...]], Impulses],
+    joints: tuple[Rows, ...],
+    contacts: tuple[ContactRows, ...],
+    velocity: Array,
+    solved: Array,
+    impulses: Impulses,
+) -> tuple[Array, Impulses]:
+    """Velocity and impulses, with less rebound in the worlds that bounce and whose contacts do work.
+
+    Not differentiated: the derivatives are those of the full rebound.
+
+    Args:
+      solve: impulses of rows.
+      joints, contacts: all rows of the step.
+      velocity: (component, block, world) without them.
+      solved, impulses: velocity, and impulses of all groups, with the full rebound.
+    """
+    full = solved, impulses
+    joints, contacts, velocity, solved, impulses = lax.stop_gradient((joints, contacts, velocity, solved, impulses))
+    rows = (*joints, *(contact.rows for contact in contacts))
+    gains = _gains(contacts, 0.5 * (velocity + solved), impulses[len(joints) :])
+
+    def share_out(solved: Array, impulses: Impulses) -> tuple[Array, Impulses]:
+        inelastic = tuple(dataclasses.replace(contact.rows, bias=_without(contact.rows.bias)) for contact in contacts)
+        stopping = solve((*joints, *inelastic))
+        stopped = add_impulses(rows, velocity, stopping)
+        more = tuple(last - first for first, last in zip(stopping, impulses, strict=True))
+        share = _share(contacts, velocity, stopped, solved, stopping[len(joints) :], more[len(joints) :])
+        share = jnp.where(gains, share, 1.0)
+        return jax.tree.map(
+            lambda first, more, full: jnp.where(gains, first + share * more, full),
+            (stopped, stopping),
+            (solved - stopped, more),
+            (solved, impulses),
+        )
+
+    limited = lax.cond(gains.any(), share_out, lambda *unchanged: unchanged, solved, impulses)
+    return jax.tree.map(lambda full, less: full + (less - lax.stop_gradient(full)), full, limited)
+
+
+def _gains(contacts: tuple[ContactRows, ...], middle: Array, impulses: Impulses) -> Array:
+    """Worlds (world,) where something bounces and all contacts together do work, at the mean velocity `middle`."""
+    work, turnover, rebounds = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    for contact, impulse in zip(contacts, impulses, strict=True):
+        done = impulse * _rate(contact, middle)
+        rebound = impulse[:, :1] * jnp.maximum(-contact.rows.bias[:, :1], 0.0)
+        work = work + add_all_slices(done)
+        rebounds = rebounds + add_all_slices(rebound)
+        turnover = turnover + add_all_slices(jnp.abs(done))
+    noise = ROUND_OFF * jnp.finfo(middle.dtype).eps * (turnover + rebounds)
+    return settle(jnp.where(rebounds > 0, jnp.where(work > noise, 1.0, 0.0), 0.0)) > 0.5
+
+
+def _share(
+    contacts: tuple[ContactRows, ...],
+    velocity: Array,
+    stopped: Array,
+    solved: Array,
+    stopping: Impulses,
+    more: Impulses,
+) -> Array:
+    """Share (world,) of what rebounds add, `more`, to the impulses `stopping` at which contacts do no work.
+
+    Or no more work than without rebound, where other things press them to do some.
+    """
+    lost, slope, bend = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
+    for contact, first, added in zip(contacts, stopping, more, strict=True):
+        rate, faster = _rate(contact, 0.5 * (velocity + stopped)), row_velocity(contact.rows, solved - stopped)
+        lost = lost - add_all_slices(first * rate)
+        slope = slope + add_all_slices(added * rate + 0.5 * first * faster)
+        bend = bend + add_all_slices(added * faster)
+    lost = jnp.maximum(lost, 0.0)
+    root = safe_sqrt(jnp.maximum(slope * slope + 2.0 * bend * lost, 0.0))
+    share = jnp.where(slope > 0, safe_divide(2.0 * lost, slope + root), safe_divide(root - slope, bend))
+    return jnp.clip(share, 0.0, 1.0)
+
+
+def _rate(contact: ContactRows, middle: Array) -> Array:
+    """Rate (turn, row, column, world) of each row at the velocity `middle`, the mean over its impulse.
+
+    Less what gravity does along the way that the impulse makes.
+    """
+    assert contact.falling is not None
+    return row_velocity(contact.rows, middle) - contact.falling
+
+
+def _without(bias: Array) -> Array:
+    """Biases without rebound, which alone is negative."""
+    return jnp.concatenate([jnp.maximum(bias[:, :1], 0.0), bias[:, 1:]], axis=1)
