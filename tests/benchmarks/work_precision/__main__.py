@@ -81,7 +81,7 @@ def write(report: dict, output: pathlib.Path) -> None:
     table = json.dumps(report["error_table"], indent=1) + "\n"
     (output / "work_precision.json").write_text(json.dumps(report, indent=1) + "\n")
     (output / "work_precision.md").write_text(markdown(report))
-    complete = output == RESULTS and set(SCENES) <= set(measured)
+    complete = output.resolve() == RESULTS.resolve() and set(SCENES) <= set(measured)
     (PACKAGE_TABLE if complete else output / PACKAGE_TABLE.name).write_text(table)
     if measured:
         plots.draw(measured, output)
