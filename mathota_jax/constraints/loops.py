@@ -6,10 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mathota_jax.bodies import vector
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import looped_slots
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.vector import norm
 
 OPEN = 0.1
 """Error beyond which a joint counts as open: an angle in rad, a gap as a share of the joint's way to its moving bodies."""
@@ -25,7 +27,7 @@ def are_open(model: Model, joints: JointRows) -> Array | None:
     reach = jnp.zeros(())
     for side, anchors in (("parent", model.joint_anchor_parent), ("child", model.joint_anchor_child)):
         bodies = np.array([getattr(scene.joints[joint], side) for joint in place])
-        arm = jnp.sqrt((lax.stop_gradient(take(anchors, place)) ** 2).sum(1))
+        arm = norm(vector(lax.stop_gradient(take(anchors, place))))
         moves = ~np.asarray(scene.static)[bodies]
         reach = reach + jnp.where(moves[:, None], arm + lax.stop_gradient(take(model.size, bodies)), 0.0)
     limit = OPEN * jnp.where(angular[:, None], 1.0, reach)

@@ -158,7 +158,7 @@ def _held_joints(scene: Scene) -> tuple[dict[int, _Slots], dict[int, tuple[int, 
     return held, {joint: tuple(block_of.get(body, GROUND) for body in pair) for joint, pair in bodies.items()}
 
 
-def _held_slots(group: JointGroup, place: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _held_slots(group: JointGroup, place: int) -> _Slots:
     """Slots of the rows of a joint that hold translations, and rotations, whatever happens."""
     kind, row = group.kind, group.kind.fixed_row_count
     rows: tuple[list[int], list[int]] = ([*range(kind.fixed_translations)], [*range(kind.fixed_translations, row)])
@@ -193,7 +193,7 @@ def _grow(
     links: list[Link],
     joints: list[int],
     ends: dict[int, tuple[int, ...]],
-    held: dict[int, tuple[tuple[int, ...], tuple[int, ...]]],
+    held: dict[int, _Slots],
 ) -> None:
     """Adds the links of one tree."""
     grounded = [joint for joint in joints if GROUND in ends[joint]]

@@ -308,7 +308,7 @@ def _solve_linear(
 def _linear_sweeps(
     iterations: int, rows: tuple[Rows, ...], update: TurnUpdate, coefficients: tuple[object, ...], nothing: Array
 ) -> tuple[Array, ...]:
-    """Impulses after sweeps from 0, which are accelerated in all scenes of contacts with friction alone."""
+    """Impulses after sweeps from 0, which are accelerated, and of even number, in scenes of contacts with friction alone."""
     zeros = tuple(jnp.zeros_like(group.bias) for group in rows)
     if not _accelerate(rows):
         return sweeps(iterations, rows, lambda _, *of_turn: update(*of_turn), coefficients, zeros, nothing, zeros)[1]

@@ -207,7 +207,7 @@ def add_changes(group: Rows, matrix: Changes, velocity: Array, impulse: Array) -
 def _terms(table: Table) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Turns and columns (block,) in which blocks receive something, each used once, and whether there is one at all."""
     receivers = table.receivers
-    columns = len(table.blocks) * len(table.slots[0]) // table.together
+    columns = len(table.blocks) * table.column_count // table.together
     turns = [np.flatnonzero(of_block < columns) for of_block in receivers.T]
     terms = []
     for k in range(max(len(turn) for turn in turns)):
