@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.collision.broadphase import Admissible, Bounds
+from mathota_jax.collision.broadphase import Admissible, Bounds, Planes
 from mathota_jax.collision.placement import shape_parameters, shape_poses
 from mathota_jax.geometry.bounds import aabb, bounding_radius
 from mathota_jax.scene import Scene
@@ -70,9 +70,11 @@ def swept_bounds(
       displacements: of all bodies [m], possible translations in the step.
       turn: (body, world) largest angle [rad] by which each body may turn in the step; None for no turn.
     """
-    parts = []
+    parts, planes = [], None
     for kind, places in kind_ranges(scene):
         parameters, pose = placed_shapes(scene, shapes, kind, places, position, orientation)
+        if kind == "plane":
+            planes = Planes(parameters["normal"], parameters["offset"])
         low, high = aabb(kind, parameters, pose)
         reach = bounding_radius(kind, parameters)
         center = pose.position
@@ -92,7 +94,7 @@ def swept_bounds(
             far = jnp.maximum(far, norm(shift))
         low, high = low.map(lambda x, g=growth: x - g), high.map(lambda x, g=growth: x + g)
         parts.append((len(places), Bounds(low, high, center, reach + growth + far)))
-    return _joined(parts)
+    return _joined(parts)._replace(planes=planes)
 
 
 def _offset(scene: Scene, position: Vec3, bodies: list[int], center: Vec3) -> Array:

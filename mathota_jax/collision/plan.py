@@ -16,7 +16,14 @@ OWN_SLOTS_UP_TO = 20
 """Pairs that keep slots of their own; beyond, finding the close ones is cheaper than solving all (measured with stacks)."""
 
 UNPLANNED_KINDS = ("plane", "heightfield", "polyhedron")
-"""Kinds whose pairs always have slots: unbounded ones touch everything, faces of polyhedra are static."""
+"""Kinds whose pairs have slots of their own: heightfields touch everything, faces of polyhedra are static."""
+
+OWN_PLANE_POINTS = 8
+"""Points on planes for each moving shape up to which all have slots: those of one box on two planes, a ball in a bin.
+
+A pile of 27 boxes in a bin of five planes touches 80 of 540 points, and solving those alone is twice as fast; a stack on
+one plane gains 6 %, and balls in a bin, with a point for each plane, lose as much (measured).
+"""
 
 PAIRS_PER_SHAPE = 8
 """Close pairs for each moving shape: equal spheres have at most 6, boxes somewhat more, their bounds touch sooner."""
@@ -54,14 +61,20 @@ def plan_broadphase(
     fixed = len(shapes) - moving
     pair_count = moving * (moving - 1) // 2 + moving * fixed
     # A search along the motion needs pairs that have slots of their own.
-    own_up_to = ONE_BY_ONE_UP_TO if options.continuous or options.impact_events else OWN_SLOTS_UP_TO
+    in_motion = options.continuous or options.impact_events
+    own_up_to = ONE_BY_ONE_UP_TO if in_motion else OWN_SLOTS_UP_TO
     few = options.broadphase == "auto" and pair_count <= own_up_to
     if options.broadphase == "none" or few or pair_count == 0:
         return None
     sizes = [reach[entries[k].body] for k in shapes]
     method = choose_method(moving, fixed, sizes) if options.broadphase == "auto" else options.broadphase
-    capacity = options.pair_capacity or max(PAIRS_PER_SHAPE * moving, ONE_BY_ONE_UP_TO)
-    capacity = min(capacity, pair_count)
+    room = options.pair_capacity or max(PAIRS_PER_SHAPE * moving, ONE_BY_ONE_UP_TO)
+    planes = [k for k, entry in enumerate(entries) if collides[entry.body] and entry.kind == "plane"]
+    points = [PAIRS["plane", entries[k].kind].point_count for k in shapes if not static[entries[k].body]]
+    many = len(planes) * sum(points) > OWN_PLANE_POINTS * moving
+    if many and room <= ONE_BY_ONE_UP_TO and not in_motion:
+        shapes, pair_count = planes + shapes, pair_count + moving * len(planes)
+    capacity = min(room, pair_count)
     one_by_one = capacity <= ONE_BY_ONE_UP_TO
     groups = _groups(
         [(entries[k].kind, static[entries[k].body]) for k in shapes], sizes, capacity if one_by_one else None

@@ -89,7 +89,7 @@ def close_pairs(model: Model, bodies: Bodies, free: tuple[Vec3, Vec3] | None) ->
 def _turns_matter(scene: Scene, model: Model) -> bool:
     """Not for spheres about the centres of mass of their bodies."""
     kinds = {kind for group in scene.compact_groups for kind in (group.kind_a, group.kind_b)}
-    return kinds != {"sphere"} or "local_position" in model.shapes["sphere"]
+    return kinds - {"plane"} != {"sphere"} or "local_position" in model.shapes["sphere"]
 
 
 def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:

@@ -83,6 +83,36 @@ def test_same_contacts_of_boxes(float64, gate):
         np.testing.assert_allclose(found[pair], separations, atol=1e-12)
 
 
+@functools.cache
+def in_a_corner(method):
+    """Seven boxes pressed into the corner of a floor, a wall and a leaning wall, after 40 steps."""
+    builder = SceneBuilder(gravity=(-4.0, -GRAVITY, -3.0))
+    builder.add_body(Plane((0, 1, 0)), static=True)
+    builder.add_body(Plane((1, 0, 0), -0.13), static=True)
+    builder.add_body(Plane((0, 0.3, 1), -0.085), static=True)
+    rng = np.random.default_rng(4)
+    for index in range(7):
+        place = 0.22 * np.array([index % 2, index // 4, index // 2 % 2]) + 0.01 * rng.normal(size=3) + [0, 0.12, 0]
+        builder.add_body(Box((0.1, 0.09, 0.08)), mass=1.0, position=place)
+    options = {"dt": 1 / 240, "linear_damping": 0.0, "angular_damping": 0.0, **CONVERGED}
+    model, state = builder.build(Options(broadphase=method, **options))
+    return model, advance(model, state, 40)
+
+
+def test_pairs_with_many_planes_are_listed(float64, gate):
+    """A box with slots for twelve points on planes touches few of them: close planes only, and the same motion."""
+    own_model, own = in_a_corner("none")
+    model, state = in_a_corner("auto")
+    assert own_model.scene.broadphase is None
+    assert not model.scene.pair_groups
+    assert [group.kind_a for group in model.scene.compact_groups] == ["plane", "box"]
+    assert touching(model, state).keys() == touching(own_model, own).keys()
+    assert {a for a, _ in touching(model, state)} >= {0, 1, 2}
+    gate("position [m]", state.position - own.position, 1e-7)
+    gate("velocity [m/s]", state.velocity - own.velocity, 1e-5)
+    assert not int(state.flags)
+
+
 def test_worlds_may_share_what_the_last_step_found():
     """A batch over the positions alone: the pairs and forces of the last step are one for all worlds."""
     model, state = heap(3, broadphase="all_pairs")

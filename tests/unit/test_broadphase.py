@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, candidate_pairs
+from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, Planes, candidate_pairs
 from mathota_jax.collision.broadphase.choice import choose_method
 from mathota_jax.spatial.vector import Vec3
 
@@ -189,6 +189,60 @@ def test_bad_shapes_are_flagged_and_in_no_pair(method, bad, precision):
         kept = [p for p in sorted(expected[world]) if world != 1 or not {0, 7, 44} & set(p)]
         assert listed(pairs, world) == kept
     np.testing.assert_array_equal(pairs.invalid, [False, True, False])
+
+
+def planes_and_boxes(dtype, count=40):
+    """Bounds of four planes and `count` boxes, who may collide, and for each world {(plane, shape): depth}."""
+    rng = np.random.default_rng(7)
+    center, half = cloud(rng, count)
+    normal = rng.normal(size=(WORLDS, 4, 3))
+    normal[:, 0] = [0.0, 1.0, 0.0]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal, offset = normal.astype(dtype), rng.uniform(-0.9, -0.2, (WORLDS, 4)).astype(dtype)
+    without = np.full((WORLDS, 4, 3), np.nan)
+    bounds = bounds_of(np.concatenate([without, center], 1), np.concatenate([without, half], 1), dtype)
+    vector = Vec3(*(jnp.asarray(normal[..., axis].T) for axis in range(3)))
+    planes = Planes(vector, jnp.asarray(offset.T))
+    bodies = (0, 0, 1, 2, *range(3, count + 3))
+    admissible = Admissible(bodies, tuple(k < 4 or k % 5 == 0 for k in range(count + 4)), ((1, 3), (1, 4)))
+    low, high = (np.stack([np.asarray(c, float) for c in corner]) for corner in bounds[:2])
+    expected = brute_force(bounds, admissible)
+    for world in range(WORLDS):
+        for plane in range(4):
+            n = normal[world, plane].astype(float)
+            corners = np.where(n[:, None] > 0, low[:, :, world], high[:, :, world])
+            spheres = n @ center[world].astype(dtype).T - np.asarray(bounds.radius, float)[4:, world] * (1 + 1e-4)
+            lowest = np.maximum(n @ corners[:, 4:], spheres)
+            for shape in range(4, count + 4):
+                depth = offset[world, plane] - lowest[shape - 4]
+                if depth >= 0 and not admissible.static[shape] and not (plane == 2 and shape in (4, 5)):
+                    expected[world][plane, shape] = depth
+    return bounds._replace(planes=planes), admissible, expected
+
+
+@pytest.mark.parametrize("method", BROADPHASES)
+def test_planes_meet_what_reaches_below_them(method, precision):
+    bounds, admissible, expected = planes_and_boxes(precision)
+    pairs = compiled(method, bounds, admissible, 44 * 43 // 2)
+    for world in range(WORLDS):
+        assert listed(pairs, world) == sorted(expected[world])
+        assert 20 < sum(first < 4 for first, _ in expected[world]) < 100
+    assert not np.any(pairs.overflow)
+    assert not np.any(pairs.invalid)
+    few = compiled(method, bounds, admissible, 25)
+    for world in range(WORLDS):
+        ranked = sorted(expected[world], key=lambda pair, depth=expected[world]: (-np.float32(depth[pair]), pair))
+        assert len(set(listed(few, world)) & set(ranked[:25])) >= 24  # two depths may be equal but for the last bit
+    assert np.all(few.overflow)
+
+
+@pytest.mark.parametrize("method", BROADPHASES)
+def test_bad_planes_are_flagged(method):
+    bounds, admissible, _ = planes_and_boxes(np.float32)
+    bad = bounds.planes._replace(offset=bounds.planes.offset.at[2, 1].set(np.nan))
+    np.testing.assert_array_equal(
+        compiled(method, bounds._replace(planes=bad), admissible, 100).invalid, [False, True, False]
+    )
 
 
 @pytest.mark.parametrize("method", BROADPHASES)

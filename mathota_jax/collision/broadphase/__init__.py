@@ -8,8 +8,9 @@ from collections.abc import Callable
 from mathota_jax.collision.broadphase.all_pairs import all_pairs
 from mathota_jax.collision.broadphase.bvh import bvh
 from mathota_jax.collision.broadphase.grid import grid
-from mathota_jax.collision.broadphase.pair_list import Admissible, Bounds, PairList
+from mathota_jax.collision.broadphase.pair_list import Admissible, PairList
 from mathota_jax.collision.broadphase.sort_and_sweep import sort_and_sweep
+from mathota_jax.collision.broadphase.volumes import Bounds, Planes
 
 BROADPHASES: dict[str, Callable[[Bounds, Admissible, int], PairList]] = {
     "all_pairs": all_pairs,
@@ -20,7 +21,7 @@ BROADPHASES: dict[str, Callable[[Bounds, Admissible, int], PairList]] = {
 
 
 def candidate_pairs(method: str, bounds: Bounds, admissible: Admissible, capacity: int) -> PairList:
-    """Pairs of shapes whose bounding boxes and bounding spheres overlap.
+    """Pairs of shapes whose bounding boxes and bounding spheres overlap, and of planes and shapes that reach below them.
 
     Args:
       method: key of `BROADPHASES`.
@@ -35,4 +36,4 @@ def candidate_pairs(method: str, bounds: Bounds, admissible: Admissible, capacit
     return BROADPHASES[method](bounds, admissible, capacity)
 
 
-__all__ = ["BROADPHASES", "Admissible", "Bounds", "PairList", "candidate_pairs"]
+__all__ = ["BROADPHASES", "Admissible", "Bounds", "PairList", "Planes", "candidate_pairs"]

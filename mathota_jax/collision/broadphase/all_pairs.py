@@ -8,13 +8,12 @@ from jax import Array, lax
 
 from mathota_jax.collision.broadphase.pair_list import (
     Admissible,
-    Bounds,
     Enumerate,
     PairList,
     Visit,
     collect,
-    finite_bounds,
 )
+from mathota_jax.collision.broadphase.volumes import Bounds, finite_bounds
 
 CHUNK = 8192
 """Pairs tested at a time, so that the memory does not grow with the square of the number of shapes."""
@@ -23,7 +22,7 @@ CHUNK = 8192
 def all_pairs(bounds: Bounds, admissible: Admissible, capacity: int) -> PairList:
     """Candidate pairs by testing all; see `candidate_pairs`."""
     bounds, bad = finite_bounds(bounds)
-    first, second = admissible.pairs
+    first, second = (side[admissible.pairs[0] >= bounds.plane_count] for side in admissible.pairs)
     return collect([_listed(first, second, bounds.radius)], bounds, bad, admissible, capacity, ordered=True)
 
 

@@ -16,15 +16,14 @@ from jax import Array, lax
 
 from mathota_jax.collision.broadphase.pair_list import (
     Admissible,
-    Bounds,
     Enumerate,
     PairList,
     Visit,
     collect,
-    finite_bounds,
 )
 from mathota_jax.collision.broadphase.ranges import sort_shapes
 from mathota_jax.collision.broadphase.sort_and_sweep import sweep
+from mathota_jax.collision.broadphase.volumes import Bounds, finite_bounds
 from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.settle import settle, settle_code
 from mathota_jax.spatial.vector import Vec3

@@ -12,13 +12,12 @@ from jax import Array
 
 from mathota_jax.collision.broadphase.pair_list import (
     Admissible,
-    Bounds,
     Enumerate,
     PairList,
     collect,
-    finite_bounds,
 )
 from mathota_jax.collision.broadphase.ranges import lower_bound, range_pairs, sort_shapes, upper_bound
+from mathota_jax.collision.broadphase.volumes import Bounds, finite_bounds
 from mathota_jax.spatial.indexing import gather
 from mathota_jax.spatial.settle import settle_code
 

@@ -1,4 +1,4 @@
-"""What every broadphase method takes and gives: bounds, which pairs may collide, and the list of pairs found."""
+"""What every broadphase method takes and gives: which pairs may collide, and the list of pairs found."""
 
 from __future__ import annotations
 
@@ -12,29 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.spatial.indexing import gather
-from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.vector import Vec3
+from mathota_jax.collision.broadphase.volumes import Bounds, overlaps, plane_overlaps
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.settle import settle, store
 
 LARGEST_SHAPE_COUNT = 46_340
 """Pairs are numbered ``first * count + second`` in int32."""
-
-SPHERE_MARGIN = 1e-4
-"""Relative growth of bounding spheres, so that round-off never parts spheres that touch (float32 has 1e-7)."""
-
-
-class Bounds(NamedTuple):
-    """Bounding volumes of shapes; components of shape ``(shape, world)``.
-
-    Attributes:
-      low, high: corners of the axis-aligned boxes [m] (guide 5.1).
-      center, radius: bounding spheres [m] (guide 5.3).
-    """
-
-    low: Vec3
-    high: Vec3
-    center: Vec3
-    radius: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,45 +100,14 @@ class PairList(NamedTuple):
         return jnp.arange(self.first.shape[0], dtype=jnp.int32)[:, None] < self.count
 
 
-Visit = Callable[[tuple, Array, Array, Array], tuple]
-"""``visit(carry, first, second, kept) -> carry`` for one chunk ``(pair, world)`` of possibly overlapping pairs."""
+Visit = Callable[..., tuple]
+"""``visit(carry, first, second, kept) -> carry`` for one chunk ``(pair, world)`` of possibly overlapping pairs.
+
+With a further argument, how deep they overlap [m], the pairs are taken to be admissible.
+"""
 
 Enumerate = Callable[[Visit, tuple], tuple]
 """``enumerate(visit, carry) -> carry``: shows all possibly overlapping pairs, each once, to `visit`."""
-
-
-def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
-    """Bounds without derivative, evaluated once, those of bad shapes turned inside out; and which shapes are bad.
-
-    Every method decides by comparing these numbers: were they computed again in each kernel, with other roundings, one
-    pair could come out both ways.
-    """
-    bounds = jax.lax.stop_gradient(bounds)
-    worlds = max(component.shape[-1] for component in (*bounds.low, *bounds.high, *bounds.center, bounds.radius))
-    count = bounds.low.x.shape[0]
-    low, high, center, radius = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, worlds)), bounds)
-    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in (*low, *high, *center, radius)])
-    largest = float(jnp.finfo(radius.dtype).max)
-    low, high = low.map(lambda x: jnp.where(finite, x, largest)), high.map(lambda x: jnp.where(finite, x, -largest))
-    center, radius = center.map(lambda x: jnp.where(finite, x, 0.0)), jnp.where(finite, radius, 0.0)
-    return compute_once(Bounds(low, high, center, radius), radius), ~finite
-
-
-def overlaps(bounds: Bounds, first: Array, second: Array) -> tuple[Array, Array]:
-    """Whether boxes and spheres overlap (guide 5.2 and 5.3), and by how much the boxes do along the best axis [m]."""
-    depth = None
-    for low, high in zip(bounds.low, bounds.high, strict=True):
-        top = jnp.minimum(gather(high, first), gather(high, second))
-        along = top - jnp.maximum(gather(low, first), gather(low, second))
-        depth = along if depth is None else jnp.minimum(depth, along)
-    assert depth is not None
-    squared = jnp.zeros(())
-    for center in bounds.center:
-        between = gather(center, second) - gather(center, first)
-        squared = squared + between * between
-    reach = (gather(bounds.radius, first) + gather(bounds.radius, second)) * (1.0 + SPHERE_MARGIN)
-    # A subtraction is negative, zero or positive exactly when the comparison says so.
-    return (depth >= 0) & (squared <= reach * reach), depth
 
 
 def collect(
@@ -164,25 +116,28 @@ def collect(
     """The pairs that the enumerators show, tested, in a list of fixed capacity.
 
     Args:
-      enumerators: together show each pair at most once, and every pair whose boxes overlap.
-      bounds, bad: from `finite_bounds`.
+      enumerators: together show each pair at most once, and every pair whose boxes overlap; no planes.
+      bounds, bad: from `finite_bounds`. Pairs of planes, if there are any, are found here.
       admissible: which pairs may collide.
       capacity: places of the list.
       ordered: whether the enumerators show pairs in ascending order already.
     """
     worlds, count = bounds.radius.shape[-1], admissible.shape_count
+    if bounds.planes is not None:
+        enumerators = [_of_planes(bounds, bad, admissible), *enumerators]
     empty = jnp.iinfo(jnp.int32).max
 
-    def hits(first: Array, second: Array, kept: Array) -> tuple[Array, Array, Array]:
+    def hits(first: Array, second: Array, kept: Array, depth: Array | None) -> tuple[Array, Array, Array]:
         low, high = jnp.minimum(first, second), jnp.maximum(first, second)
-        touch, depth = overlaps(bounds, low, high)
-        kept = kept & touch & admissible.test(low, high)
+        if depth is None:
+            touch, depth = overlaps(bounds, low, high)
+            kept = kept & touch & admissible.test(low, high)
         return settle(jnp.where(kept, 1.0, 0.0)) > 0, low * count + high, depth
 
     def append(limit: tuple[Array, Array]) -> Callable:
-        def visit(carry: tuple, first: Array, second: Array, kept: Array) -> tuple:
+        def visit(carry: tuple, first: Array, second: Array, kept: Array, depth: Array | None = None) -> tuple:
             keys, found, total = carry
-            hit, key, depth = hits(first, second, kept)
+            hit, key, depth = hits(first, second, kept, depth)
             shallowness = _shallowness(depth)
             listed = hit & ((shallowness < limit[0]) | ((shallowness == limit[0]) & (key <= limit[1])))
             place = found + jnp.cumsum(listed.astype(jnp.int32), axis=0) - 1
@@ -213,7 +168,32 @@ def collect(
     used = keys != empty
     first = jnp.where(used, keys // count, 0)
     second = jnp.where(used, keys - (keys // count) * count, min(1, count - 1))
-    return PairList(first, second, total, total > capacity, bad.any(0))
+    return PairList(first, second, total, total > capacity, _invalid(bounds, bad))
+
+
+def _of_planes(bounds: Bounds, bad: Array, admissible: Admissible) -> Enumerate:
+    """Enumerates the pairs of a plane and a shape that reaches below it, in ascending order."""
+    first, second = (side[admissible.pairs[0] < bounds.plane_count] for side in admissible.pairs)
+    depth = plane_overlaps(bounds)
+    depth = take(depth.reshape(-1, depth.shape[-1]), first * admissible.shape_count + second)
+    depth = store(depth, depth)
+    kept = (depth >= 0) & ~take(bad, second)
+
+    def enumerate_pairs(visit: Visit, carry: tuple) -> tuple:
+        one, two = (jnp.broadcast_to(jnp.asarray(side)[:, None], depth.shape) for side in (first, second))
+        return visit(carry, one, two, kept, depth)
+
+    return enumerate_pairs
+
+
+def _invalid(bounds: Bounds, bad: Array) -> Array:
+    """(world,) whether numbers are not finite, those apart that planes have in place of bounds."""
+    invalid = take(bad, range(bounds.plane_count, len(bad))).any(0)
+    if bounds.planes is None:
+        return invalid
+    return functools.reduce(
+        jnp.logical_or, [~jnp.isfinite(x).all(0) for x in (*bounds.planes.normal, bounds.planes.offset)], invalid
+    )
 
 
 def _shallowness(depth: Array) -> Array:
@@ -243,8 +223,8 @@ def _deepest(enumerators: Sequence[Enumerate], hits: Callable, capacity: int, wo
         shift = DIGIT_BITS * (DIGITS - 1 - turn % DIGITS)
         prefix = jnp.where(ties, key_limit, limit)
 
-        def visit(histogram: tuple, first: Array, second: Array, kept: Array) -> tuple:
-            hit, key, depth = hits(first, second, kept)
+        def visit(histogram: tuple, first: Array, second: Array, kept: Array, depth: Array | None = None) -> tuple:
+            hit, key, depth = hits(first, second, kept, depth)
             shallowness = _shallowness(depth)
             code = jnp.where(ties, key, shallowness)
             hit = hit & (~ties | (shallowness == limit)) & ((code >> shift >> DIGIT_BITS) == prefix)

@@ -12,13 +12,12 @@ from jax import Array
 
 from mathota_jax.collision.broadphase.pair_list import (
     Admissible,
-    Bounds,
     Enumerate,
     PairList,
     collect,
-    finite_bounds,
 )
 from mathota_jax.collision.broadphase.ranges import range_pairs, sort_shapes, upper_bound
+from mathota_jax.collision.broadphase.volumes import Bounds, finite_bounds
 from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.settle import settle_code
 
@@ -38,7 +37,7 @@ def sweep(bounds: Bounds, bad: Array, members: np.ndarray) -> Enumerate:
       bounds, bad: from `finite_bounds`.
       members: shapes that take part, ascending.
     """
-    bounds, excluded = take((bounds, bad), members)
+    bounds, excluded = take((bounds._replace(planes=None), bad), members)
     axis = _widest_axis(bounds, ~excluded)
     largest = jnp.finfo(bounds.radius.dtype).max
     low = jnp.where(excluded, largest, jnp.where(axis == 0, bounds.low.x, jnp.where(axis == 1, *bounds.low[1:])))
