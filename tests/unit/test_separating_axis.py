@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mathota_jax.collision.convex.difference import difference
 from mathota_jax.collision.convex.polytope import POLYTOPES, polytope
-from mathota_jax.collision.convex.separating_axis import EDGES, separating_axis
+from mathota_jax.collision.convex.separating_axis import LANES, separating_axis
 from mathota_jax.collision.polyhedron import edge_table
 from mathota_jax.geometry.hull import convex_hull, padded_faces
 from mathota_jax.spatial.pose import Pose
@@ -31,7 +31,7 @@ def axis(pair, wanted, a, pa, qa, b, pb, qb):
 @pytest.mark.parametrize("pair", [("polyhedron", "polyhedron"), ("capsule", "box"), ("sphere", "polyhedron")])
 def test_depth_of_overlapping_cores_against_the_oracle(pair, precision):
     """In more pairs than are tested at a time, of which only some are wanted."""
-    count = EDGES // 12 + 400
+    count = LANES + 400
     scene = random_scene(pair, count, reach=0.3)
     for side in "ab":
         if "radius" in scene[side]:
@@ -88,13 +88,15 @@ def test_different_polyhedra_in_one_table(float64):
 @pytest.mark.parametrize("kind", POLYTOPES)
 def test_edges_run_along_the_product_of_their_normals(kind):
     shape = jax.tree.map(lambda c: c[..., :1], to_engine(random_scene((kind, kind), 2), np.float32)[0])
-    edges = polytope(kind, with_faces(shape)).edges
+    core = polytope(kind, with_faces(shape))
     if kind == "sphere":
-        assert edges is None
+        assert core.edges is None
         return
-    across = cross(edges.left, edges.right)
-    assert (np.asarray(dot(across, edges.along)) > 0).all()
-    assert np.asarray(norm(cross(across, edges.along))).max() < 1e-5
+    for start, end, left, right in np.moveaxis(core.edges, -1, 0)[0].T:
+        along = core.vertices.map(lambda c, e=end, s=start: c[e, 0] - c[s, 0])
+        across = cross(*(core.normals.map(lambda c, f=face: c[f, 0]) for face in (left, right)))
+        assert (np.asarray(dot(across, along)) > 0).all()
+        assert np.asarray(norm(cross(across, along)) / norm(along)).max() < 1e-5
 
 
 def test_an_edge_table_names_each_edge_once():

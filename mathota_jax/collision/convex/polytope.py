@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.collision.polyhedron import edge_table, polyhedron_faces, take_vertices
-from mathota_jax.spatial.vector import Vec3, normalize
+from mathota_jax.collision.polyhedron import edge_table, polyhedron_faces
+from mathota_jax.spatial.vector import Vec3
 
 AXES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
 BOX_CORNERS = np.array([[1 if code >> axis & 1 else -1 for axis in range(3)] for code in range(8)])
@@ -26,33 +25,19 @@ SIDEWAYS = AXES[[0, 5, 1, 4]]
 """Normals of a segment along y, in the order in which its four arcs follow each other about +y."""
 
 
-class Edges(NamedTuple):
-    """Edges with the outward normals on both sides; components (edge, pair, world).
+class Polytope(NamedTuple):
+    """A convex polytope in its own frame.
 
     Attributes:
-        start: One end.
-        along: Unit vector along the edge, parallel to ``left x right``.
-        left: Normal of the face to the left, seen from outside.
-        right: Normal of the other face.
+        vertices: Components (vertex, pair, world).
+        normals: Outward unit normals of the faces; components (face, pair, world).
+        edges: int32 (4, edge, pair): vertices at the start and the end, faces to the left and the right, seen from
+            outside (`collision.polyhedron.edge_table`). None where no edge has a direction of its own.
     """
-
-    start: Vec3
-    along: Vec3
-    left: Vec3
-    right: Vec3
-
-
-def row_count(edges: Edges) -> int:
-    """How many edges there are; components that all edges share have one row."""
-    return max(component.shape[0] for component in jax.tree.leaves(edges))
-
-
-class Polytope(NamedTuple):
-    """Components (vertex, pair, world) and (face, pair, world) of vertices and outward unit normals; and the edges."""
 
     vertices: Vec3
     normals: Vec3
-    edges: Edges | None
+    edges: np.ndarray | None
 
 
 def polytope(kind: str, shape: dict[str, Any]) -> Polytope:
@@ -77,33 +62,22 @@ def _point(shape: dict[str, Any]) -> Polytope:
 
 def _segment(shape: dict[str, Any]) -> Polytope:
     half = shape["half_height"]
-    normals = _rows(SIDEWAYS, half)
     ends = _rows([(0, 1, 0), (0, -1, 0)], half) * half
-    start, along = ends.map(lambda c: c[1:]), _rows([(0, 1, 0)], half)
-    following = normals.map(lambda c: jnp.roll(c, -1, axis=0))
-    return Polytope(ends, normals, Edges(start, along, normals, following))
+    side = np.arange(4)
+    arcs = np.stack([np.ones(4), np.zeros(4), side, np.roll(side, -1)])
+    return Polytope(ends, _rows(SIDEWAYS, half), arcs.astype(np.int32)[..., None])
 
 
 def _box(shape: dict[str, Any]) -> Polytope:
     half: Vec3 = shape["half_extents"]
     corners = _rows(BOX_CORNERS, half.x)
     vertices = Vec3(*(c * h for c, h in zip(corners, half, strict=True)))
-    start, end, left, right = edge_table(BOX_FACES[None])
-    along = (BOX_CORNERS[end[:, 0]] - BOX_CORNERS[start[:, 0]]) / 2
-    # The direction is known without the extents, of which one may be zero.
-    faces = (_rows(AXES[side[:, 0]], half.x) for side in (left, right))
-    return Polytope(vertices, _rows(AXES, half.x), Edges(take_vertices(vertices, start), _rows(along, half.x), *faces))
+    return Polytope(vertices, _rows(AXES, half.x), edge_table(BOX_FACES[None]))
 
 
 def _polyhedron(shape: dict[str, Any]) -> Polytope:
     vertices: Vec3 = shape["vertices"]
-    normals = polyhedron_faces(vertices, shape["faces"]).normal
-    table = edge_table(shape["faces"])
-    ends, sides = take_vertices(vertices, table[:2]), take_vertices(normals, table[2:])
-    first, second = (ends.map(lambda c, k=k: c[k]) for k in range(2))
-    left, right = (sides.map(lambda c, k=k: c[k]) for k in range(2))
-    edges = Edges(first, normalize(second - first), left, right)
-    return Polytope(vertices, normals, edges)
+    return Polytope(vertices, polyhedron_faces(vertices, shape["faces"]).normal, edge_table(shape["faces"]))
 
 
 POLYTOPES: dict[str, Callable[[dict[str, Any]], Polytope]] = {
