@@ -10,6 +10,7 @@ from jax import Array
 from mathota_jax.collision.bounds import Shapes, kind_ranges, placed_shapes
 from mathota_jax.collision.narrowphase import ContactSet, flatten
 from mathota_jax.collision.pairs import PAIRS
+from mathota_jax.collision.polyhedron import polyhedra_of_places
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.spatial.indexing import gather_together
 from mathota_jax.spatial.pose import Pose
@@ -37,8 +38,11 @@ def compact_contacts(
     ranges = dict(kind_ranges(scene))
 
     def placed(kind: str, index: Array) -> tuple[dict[str, Any], Pose]:
-        everything = placed_shapes(scene, shapes, kind, ranges[kind], position, orientation)
-        return gather_together(everything, index - ranges[kind].start)
+        parameters, pose = placed_shapes(scene, shapes, kind, ranges[kind], position, orientation)
+        row = index - ranges[kind].start
+        if kind == "polyhedron":
+            return polyhedra_of_places(parameters, row), gather_together(pose, row)
+        return gather_together((parameters, pose), row)
 
     (a, pose_a), (b, pose_b) = placed(group.kind_a, pair[0]), placed(group.kind_b, pair[1])
     manifold = PAIRS[group.kind_a, group.kind_b].function(a, pose_a, b, pose_b)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
-from mathota_jax.collision.polyhedron import polyhedron_faces
+from mathota_jax.collision.polyhedron import face_corners, face_normals
 from mathota_jax.collision.rim import rim_points
 from mathota_jax.spatial.settle import settle_code
 from mathota_jax.spatial.vector import Vec3, dot, where
@@ -93,11 +93,18 @@ def _on_leading_axis(values: Any, like: Array) -> Array:
 
 def polyhedron_face(polyhedron: dict[str, Any], direction: Vec3) -> Face:
     """One of the polygons; corners are numbered as vertices."""
-    faces = polyhedron_faces(polyhedron["vertices"], polyhedron["faces"])
-    _, code = best_candidate(dot(lax.stop_gradient(faces.normal), lax.stop_gradient(direction)))
-    normal, corners = pick((faces.normal, faces.corners.map(lambda c: jnp.swapaxes(c, 0, 1))), code)
-    table = jnp.asarray(np.moveaxis(polyhedron["faces"], 0, -1)[..., None], jnp.int32)
-    return Face(corners, normal, jnp.zeros_like(direction.x), pick(table, code))
+    vertices: Vec3 = polyhedron["vertices"]
+    normals = face_normals(polyhedron)
+    _, code = best_candidate(dot(lax.stop_gradient(normals), lax.stop_gradient(direction)))
+    # Looked up: a sum over a mask, as `pick` makes it, costs more the more corners and faces there are.
+    ids = face_corners(polyhedron, code)
+    return Face(vertices.map(lambda c: _looked_up(c, ids)), pick(normals, code), jnp.zeros_like(direction.x), ids)
+
+
+def _looked_up(values: Array, ids: Array) -> Array:
+    """Rows of (vertex, pair or 1, world or 1) by number (corner, pair, world)."""
+    values = jnp.broadcast_to(values, (values.shape[0], *jnp.broadcast_shapes(values.shape[1:], ids.shape[1:])))
+    return jnp.take_along_axis(values, ids, axis=0, mode="promise_in_bounds")
 
 
 def cylinder_face(cylinder: dict[str, Any], direction: Vec3) -> Face:

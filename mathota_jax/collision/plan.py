@@ -15,8 +15,8 @@ from mathota_jax.scene import Broadphase, CompactGroup, ShapeEntry, Tier
 OWN_SLOTS_UP_TO = 20
 """Pairs that keep slots of their own; beyond, finding the close ones is cheaper than solving all (measured with stacks)."""
 
-UNPLANNED_KINDS = ("plane", "heightfield", "polyhedron")
-"""Kinds whose pairs have slots of their own: heightfields touch everything, faces of polyhedra are static."""
+UNPLANNED_KINDS = ("plane", "heightfield")
+"""Kinds whose pairs have slots of their own: what is unbounded, or below everything, is close to most."""
 
 OWN_PLANE_POINTS = 8
 """Points on planes for each moving shape up to which all have slots: those of one box on two planes, a ball in a bin.

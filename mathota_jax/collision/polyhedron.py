@@ -1,14 +1,23 @@
-"""Faces and edges of polyhedra: vertices on the leading axis, incidence known at trace time."""
+"""Faces and edges of polyhedra: vertices on the leading axis, incidence known at trace time.
+
+Which polyhedron a pair has may be known in the step only (`polyhedra_of_places`). Then its parameters hold, beside its
+"vertices", all polyhedra of the scene (the "table" of their vertices, and their "faces") and the "row" (pair, world) of its
+own.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.indexing import gather_inner, unstack
 from mathota_jax.spatial.vector import Vec3, cross, normalize
+
+TOPOLOGY = ("faces", "row", "table")
+"""Parameters of a polyhedron that are no lengths."""
 
 
 class PolyhedronFaces(NamedTuple):
@@ -66,19 +75,11 @@ def take_vertices(vertices: Vec3, indices: np.ndarray) -> Vec3:
     return Vec3(*unstack(jnp.stack(vertices)[:, indices, np.broadcast_to(rows, indices.shape)], 0))
 
 
-def polyhedron_edges(faces: np.ndarray) -> np.ndarray:
-    """Vertex numbers of all edges, int32 (2, edge, pair); padded to a common count by repeating the first edge.
-
-    Args:
-        faces: int32 (pair, face, corner).
-    """
-    return edge_table(faces)[:2]
-
-
 def edge_table(faces: np.ndarray) -> np.ndarray:
     """All edges: vertex numbers of start and end, numbers of the faces to the left and right; int32 (4, edge, pair).
 
-    Seen from outside, the edge runs counter-clockwise about the face to its left. Padded as `polyhedron_edges`.
+    Seen from outside, the edge runs counter-clockwise about the face to its left. Padded to a common count by repeating the
+    first edge.
 
     Args:
         faces: int32 (pair, face, corner) of closed polyhedra.
@@ -94,3 +95,31 @@ def edge_table(faces: np.ndarray) -> np.ndarray:
     count = max(len(edges) for edges in lists)
     padded = [edges + edges[:1] * (count - len(edges)) for edges in lists]
     return np.moveaxis(np.asarray(padded, np.int32), -1, 0).swapaxes(1, 2)
+
+
+def polyhedra_of_places(polyhedra: dict[str, Any], row: Array) -> dict[str, Any]:
+    """Parameters of the polyhedra in the given rows (place, world) of those with vertices (vertex, row, world)."""
+    table: Vec3 = polyhedra["vertices"]
+    return {"vertices": gather_inner(table, row), "faces": polyhedra["faces"], "table": table, "row": row}
+
+
+def face_normals(polyhedron: dict[str, Any]) -> Vec3:
+    """Outward unit normals of the polyhedra of all pairs, components (face, pair, world)."""
+    if "row" not in polyhedron:
+        return polyhedron_faces(polyhedron["vertices"], polyhedron["faces"]).normal
+    return gather_inner(polyhedron_faces(polyhedron["table"], polyhedron["faces"]).normal, polyhedron["row"])
+
+
+def polyhedron_surface(polyhedron: dict[str, Any]) -> tuple[PolyhedronFaces, Vec3, Vec3]:
+    """Faces of the polyhedra of all pairs, and both ends of their edges, components (edge, pair, world)."""
+    vertices = polyhedron.get("table", polyhedron["vertices"])
+    ends = edge_table(polyhedron["faces"])[:2]
+    found = polyhedron_faces(vertices, polyhedron["faces"]), *(take_vertices(vertices, end) for end in ends)
+    return gather_inner(found, polyhedron["row"]) if "row" in polyhedron else found
+
+
+def face_corners(polyhedron: dict[str, Any], face: Array) -> Array:
+    """int32 (corner, pair, world) numbers of the vertices of a face, given by number (pair, world)."""
+    table = polyhedron["faces"]
+    row = polyhedron.get("row", np.arange(len(table), dtype=np.int32)[:, None])
+    return jnp.moveaxis(jnp.asarray(table)[row, face], -1, 0)

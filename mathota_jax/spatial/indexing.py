@@ -64,6 +64,26 @@ def gather_together(tree: Any, index: Array) -> Any:
     return jax.tree.unflatten(structure, unstack(store(chosen, chosen), 0))
 
 
+def gather_inner(tree: Any, index: Array) -> Any:
+    """Entries of all arrays (..., row, world or 1) of a pytree by traced rows (place, world): (..., place, world).
+
+    In one operation, and stored, as in `gather_together`. What all worlds share is copied row by row, without an address
+    for each number.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    worlds = max(leaf.shape[-1] for leaf in leaves)
+    parts = [leaf.reshape(-1, *leaf.shape[-2:]) for leaf in leaves]
+    table = jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:2], worlds)) for part in parts])
+    if worlds == 1:
+        chosen = jnp.take(table[..., 0], index.reshape(-1), axis=1, mode="clip").reshape(-1, *index.shape)
+    else:
+        places = jnp.broadcast_to(index, (index.shape[0], worlds))[None]
+        chosen = jnp.take_along_axis(table, places, axis=1, mode="promise_in_bounds")
+    chosen = jnp.split(store(chosen, chosen), np.cumsum([len(part) for part in parts])[:-1])
+    pairs = zip(chosen, leaves, strict=True)
+    return jax.tree.unflatten(structure, [c.reshape(*leaf.shape[:-2], *c.shape[1:]) for c, leaf in pairs])
+
+
 def unstack(array: Array, axis: int) -> list[Array]:
     """The slices of an array along `axis`, without that axis.
 

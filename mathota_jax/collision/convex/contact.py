@@ -12,6 +12,7 @@ from mathota_jax.collision.convex.polish import Closest, Ties, polish
 from mathota_jax.collision.convex.polytope import are_polytopes, polytope
 from mathota_jax.collision.convex.search import search_curved, search_polytopes
 from mathota_jax.collision.convex.support import SUPPORT
+from mathota_jax.collision.polyhedron import TOPOLOGY
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, dot, norm
@@ -53,7 +54,7 @@ def convex_distance(
     Args:
         kind_a: Kind of A, a key of `SUPPORT`.
         a: Parameters of A, components of shape ``(pair, world)``; of a polyhedron vertices ``(vertex, pair, world)`` and
-            static "faces", int32 ``(pair, face, corner)``.
+            static "faces", int32 ``(pair, face, corner)``, or as in `collision.polyhedron.polyhedra_of_places`.
         pose_a: Pose of A; its rotation may be missing where the shape needs none.
         kind_b: Kind of B.
         b: Parameters of B.
@@ -63,7 +64,7 @@ def convex_distance(
     tolerance = PROVED[str(shapes.position.x.dtype)][0 if are_polytopes((kind_a, kind_b)) else 1]
     frozen: Difference = compute_once(lax.stop_gradient(shapes), shapes.position.x)
     if are_polytopes((kind_a, kind_b)):
-        core_a, core_b = polytope(kind_a, frozen.a | _faces(a)), polytope(kind_b, frozen.b | _faces(b))
+        core_a, core_b = polytope(kind_a, frozen.a | _topology(a)), polytope(kind_b, frozen.b | _topology(b))
         searched, upper = search_polytopes(frozen, core_a, core_b, tolerance)
     else:
         searched, upper = search_curved(frozen, tolerance)
@@ -104,8 +105,8 @@ def proved(shapes: Difference, closest: Closest, upper: Array, tolerance: float)
     return closest.consistent & (lower >= upper - tolerance)
 
 
-def _faces(shape: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in shape.items() if name == "faces"}
+def _topology(shape: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in shape.items() if name in TOPOLOGY}
 
 
 def _feature(ties: Ties) -> Array:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.convex.support import SUPPORT, Parameters
+from mathota_jax.collision.polyhedron import TOPOLOGY
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm
@@ -73,8 +74,8 @@ def difference(kind_a: str, a: Parameters, pose_a: Pose, kind_b: str, b: Paramet
 
 
 def lengths(shape: Parameters) -> Parameters:
-    """The parameters that are lengths (a polyhedron also carries its static faces)."""
-    return {name: value for name, value in shape.items() if name != "faces"}
+    """The parameters that are lengths."""
+    return {name: value for name, value in shape.items() if name not in TOPOLOGY}
 
 
 def _extent(kind: str, shape: Parameters) -> Array:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.collision.polyhedron import edge_table, polyhedron_faces
+from mathota_jax.collision.polyhedron import edge_table, face_normals
 from mathota_jax.spatial.vector import Vec3
 
 AXES = np.array([(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
@@ -31,13 +31,15 @@ class Polytope(NamedTuple):
     Attributes:
         vertices: Components (vertex, pair, world).
         normals: Outward unit normals of the faces; components (face, pair, world).
-        edges: int32 (4, edge, pair): vertices at the start and the end, faces to the left and the right, seen from
+        edges: int32 (4, edge, row): vertices at the start and the end, faces to the left and the right, seen from
             outside (`collision.polyhedron.edge_table`). None where no edge has a direction of its own.
+        row: int32 (pair, world) row of `edges`; None where it is the number of the pair, or there is one only.
     """
 
     vertices: Vec3
     normals: Vec3
     edges: np.ndarray | None
+    row: Array | None = None
 
 
 def polytope(kind: str, shape: dict[str, Any]) -> Polytope:
@@ -76,8 +78,7 @@ def _box(shape: dict[str, Any]) -> Polytope:
 
 
 def _polyhedron(shape: dict[str, Any]) -> Polytope:
-    vertices: Vec3 = shape["vertices"]
-    return Polytope(vertices, polyhedron_faces(vertices, shape["faces"]).normal, edge_table(shape["faces"]))
+    return Polytope(shape["vertices"], face_normals(shape), edge_table(shape["faces"]), shape.get("row"))
 
 
 POLYTOPES: dict[str, Callable[[dict[str, Any]], Polytope]] = {

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
@@ -72,12 +73,14 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
     """
     placed = _Placed(a, b, shapes.rotation, shapes.position)
     none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
-    return lax.cond(jnp.any(wanted), functools.partial(_best_of_wanted, wanted), lambda _: none, placed)
+    return lax.cond(jnp.any(wanted), lambda: _best_of_wanted(wanted, placed), lambda: none)
 
 
 def _best_of_wanted(wanted: Array, placed: _Placed) -> Axis:
     """`_best` of the pairs that are wanted, `LANES` at a time."""
     lanes = min(LANES, wanted.size)
+    edges, rows = (placed.a.edges, placed.b.edges), (placed.a.row, placed.b.row)
+    placed = placed._replace(a=_without_edges(placed.a), b=_without_edges(placed.b))
     place = jnp.cumsum(wanted.reshape(-1), dtype=jnp.int32)
     count = place[-1]
     order = jnp.zeros(wanted.size, jnp.int32)
@@ -95,7 +98,8 @@ def _best_of_wanted(wanted: Array, placed: _Placed) -> Axis:
                 some = jnp.take(table, index, axis=-1)
                 for at, leaf in zip(places, unstack(some, 0), strict=True):
                     leaves[at] = leaf
-        axis = materialize(_best(jax.tree.unflatten(jax.tree.structure(placed), leaves)))
+        some = _with_edges(jax.tree.unflatten(jax.tree.structure(placed), leaves), edges, rows, chosen, wanted.shape)
+        axis = materialize(_best(some))
         return turn + 1, found.at[:, chosen].set(jnp.stack([*axis.direction, axis.separation]))
 
     state = jnp.zeros((), jnp.int32), jnp.zeros((4, wanted.size), placed.position.x.dtype)
@@ -108,23 +112,38 @@ _Tables = list[tuple[list[int], Array]]
 
 
 def _tables(placed: _Placed, shape: tuple[int, ...]) -> tuple[list[Array], _Tables, _Tables]:
-    """Leaves that all pairs share, (..., 1), the others stacked with their numbers: those of one shape and type in a table.
+    """Leaves that all pairs share, (..., 1), the others stacked with their numbers: those of one shape in a table.
 
     A table is (leaf, ..., pair), or (leaf, ..., lane) where worlds differ.
     """
-    leaves = [jnp.asarray(leaf) for leaf in jax.tree.leaves(placed)]
-    # Numbers of vertices and faces have no axis of worlds.
-    leaves = [leaf if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf[..., None] for leaf in leaves]
+    leaves = jax.tree.leaves(placed)
     by_pair, by_lane = [], []
-    for kind in dict.fromkeys((leaf.shape, leaf.dtype) for leaf in leaves if leaf.shape[-2:] != (1, 1)):
-        places = [place for place, leaf in enumerate(leaves) if (leaf.shape, leaf.dtype) == kind]
+    for size in dict.fromkeys(leaf.shape for leaf in leaves if leaf.shape[-2:] != (1, 1)):
+        places = [place for place, leaf in enumerate(leaves) if leaf.shape == size]
         stacked = jnp.stack([leaves[place] for place in places])
-        if kind[0][-1] == 1:
+        if size[-1] == 1:
             by_pair.append((places, stacked[..., 0]))
         else:
             stacked = jnp.broadcast_to(stacked, (*stacked.shape[:-2], *shape))
             by_lane.append((places, stacked.reshape(*stacked.shape[:-2], -1)))
     return [leaf[..., 0] for leaf in leaves], by_pair, by_lane
+
+
+def _without_edges(polytope: Polytope) -> Polytope:
+    return polytope._replace(edges=None, row=None)
+
+
+def _with_edges(placed: _Placed, edges: Sequence, rows: Sequence, chosen: Array, shape: tuple[int, ...]) -> _Placed:
+    """Both polytopes of the chosen lanes with their edges (4, edge, lane or 1)."""
+
+    def of_lanes(edges: np.ndarray | None, row: Array | None) -> Array | None:
+        if edges is None or edges.shape[-1] == 1:
+            return edges if edges is None else jnp.asarray(edges)
+        row = chosen // shape[1] if row is None else jnp.broadcast_to(row, shape).reshape(-1)[chosen]
+        return jnp.take(jnp.asarray(edges), row, axis=-1, mode="clip")
+
+    edges_a, edges_b = (of_lanes(*both) for both in zip(edges, rows, strict=True))
+    return placed._replace(a=placed.a._replace(edges=edges_a), b=placed.b._replace(edges=edges_b))
 
 
 def _best(placed: _Placed) -> Axis:

@@ -10,7 +10,7 @@ from jax import Array, lax
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.closest import clamp, direction, round_point
 from mathota_jax.collision.manifold import Manifold
-from mathota_jax.collision.polyhedron import PolyhedronFaces, polyhedron_edges, polyhedron_faces, take_vertices
+from mathota_jax.collision.polyhedron import PolyhedronFaces, polyhedron_surface
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle_code
@@ -24,9 +24,7 @@ def sphere_polyhedron(sphere: dict[str, Any], pose_a: Pose, polyhedron: dict[str
     """
     assert pose_b.rotation is not None
     center = pose_b.point_to_local(pose_a.position)
-    faces = polyhedron_faces(polyhedron["vertices"], polyhedron["faces"])
-    start, end = polyhedron_edges(polyhedron["faces"])
-    start, end = take_vertices(polyhedron["vertices"], start), take_vertices(polyhedron["vertices"], end)
+    faces, start, end = polyhedron_surface(polyhedron)
     face, edge = _closest_feature(*lax.stop_gradient((center, faces, start, end)))
     on_edge = edge >= 0
 
