@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Capsule, Options, Plane, SceneBuilder, Sphere, contact_forces, contacts, step
+from mathota_jax import Box, Capsule, Options, Plane, Polyhedron, SceneBuilder, Sphere, contact_forces, contacts, step
 from mathota_jax.state import Flag
 from tests.scenes import GRAVITY, advance, advance_worlds, invariants, repeat, stack
 
@@ -111,6 +111,59 @@ def test_pairs_with_many_planes_are_listed(float64, gate):
     gate("position [m]", state.position - own.position, 1e-7)
     gate("velocity [m/s]", state.velocity - own.velocity, 1e-5)
     assert not int(state.flags)
+
+
+def hulls_and_others(method):
+    """Polyhedra of different corners and faces on the ground, with a ball, pressed together."""
+    rng = np.random.default_rng(6)
+    points = rng.normal(size=(9, 3))
+    hulls = [
+        Polyhedron(0.12 * points / np.linalg.norm(points, axis=1, keepdims=True)),
+        Polyhedron(0.2 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])),
+        Polyhedron([[x, y, z] for x in (-0.1, 0.1) for y in (-0.08, 0.08) for z in (-0.09, 0.09)]),
+    ]
+    shapes = [*hulls, Sphere(0.1), hulls[2], hulls[0], hulls[0]]
+    builder = SceneBuilder(gravity=(0.0, -GRAVITY, 0.0))
+    builder.add_body(Plane((0, 1, 0)), static=True)
+    for index, shape in enumerate(shapes):
+        place = 0.19 * np.array([index % 2, index // 4, index // 2 % 2]) + [0, 0.1, 0]
+        builder.add_body(shape, mass=1.0, position=place + 0.003 * rng.normal(size=3))
+    return builder.build(Options(dt=1 / 240, broadphase=method, linear_damping=0.0, angular_damping=0.0, **CONVERGED))
+
+
+def test_same_contacts_of_polyhedra(float64):
+    """Which polyhedra a place holds is known in the step only: the contacts are the same."""
+    own_model, own = hulls_and_others("none")
+    model, state = hulls_and_others("all_pairs")
+    assert [group.kind_a for group in model.scene.compact_groups] == ["sphere", "polyhedron"]
+    expected, found = touching(own_model, own), touching(model, state)
+    assert len(expected) > 5
+    assert expected.keys() == found.keys()
+    for pair, separations in expected.items():
+        np.testing.assert_allclose(found[pair], separations, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_same_derivatives_of_polyhedra(float64, gate):
+    """Of a step with the same pairs, by all corners."""
+    model, state = hulls_and_others("all_pairs")
+    own_model, own = hulls_and_others("none")
+    weight = jnp.asarray(np.random.default_rng(0).normal(size=state.position.shape))
+
+    def outcome(shapes, model, state):
+        state = step(dataclasses.replace(model, shapes=shapes), state)
+        return jnp.sum((state.position + state.velocity) * weight)
+
+    @jax.jit
+    def slope(model, state):
+        along = jax.tree.map(jnp.zeros_like, model.shapes)
+        along["polyhedron"]["vertices"] = jnp.asarray(np.random.default_rng(1).normal(size=(6, 9, 3)))
+        return jax.jvp(lambda shapes: outcome(shapes, model, state), (model.shapes,), (along,))
+
+    (value, change), (own_value, own_change) = slope(model, state), slope(own_model, own)
+    assert abs(float(own_change)) > 0.1
+    gate("value, relative", value / own_value - 1, 1e-6)
+    gate("by vertices, relative", change / own_change - 1, 1e-4)
 
 
 def test_worlds_may_share_what_the_last_step_found():

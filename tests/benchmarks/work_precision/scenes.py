@@ -345,19 +345,19 @@ SCENES = {
         Scene(
             "pile27 spheres", "largest penetration of 27 spheres of 0.1 m radius at rest in a bin", "mm", 200.0, "pile",
             pile(Sphere(PILE_SIZE), 2.2 * PILE_SIZE, 0.35, 0.0), 3.0, _resting_overlap("pile27 spheres"),
-            Target(12e3, 3.0), finest=1 / 240, worlds=1, frames=12, batches=(8, 32),
-            capacity=100, settings=(*OF_PILES, TIGHT), tuned=STIFF, peers=("PyBullet",),
+            Target(12e3, 3.0), finest=1 / 240, worlds=1, frames=12, batches=(32, 128),
+            capacity=100, settings=(*OF_PILES, TIGHT, TIGHT_QUICK), tuned=STIFF, peers=("PyBullet",),
         ),
         Scene(
             "pile27 boxes", "largest penetration of 27 cubes of 0.2 m at rest in a bin", "mm", 200.0, "pile",
             pile(Box((PILE_SIZE,) * 3), 2.5 * PILE_SIZE, 0.4, 0.15), 3.0, _resting_overlap("pile27 boxes"),
-            Target(20e3, 9.0), finest=1 / 240, worlds=1, frames=12, batches=(8, 32),
-            capacity=100, settings=(*OF_PILES, TIGHT), tuned=STIFF, peers=("PyBullet",),
+            Target(20e3, 9.0), finest=1 / 240, worlds=1, frames=12, batches=(32, 128),
+            capacity=40, settings=(*OF_PILES, TIGHT, TIGHT_QUICK), tuned=STIFF, peers=("PyBullet",),
         ),
         Scene(
             "hulls8", "largest penetration of 8 hulls of 0.24 m at rest on a plane", "mm", 240.0, "pile",
             hulls(), 3.0, _resting_overlap("hulls8"), Target(6e4, 8.0), finest=1 / 240, worlds=1, frames=12,
-            batches=(16, 64), settings=OF_PILES, tuned=STIFF, peers=("PyBullet",),
+            batches=(64, 128), capacity=16, settings=(*OF_PILES, TIGHT, TIGHT_QUICK), tuned=STIFF, peers=("PyBullet",),
         ),
     )
 }  # fmt: skip
