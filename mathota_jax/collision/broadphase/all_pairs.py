@@ -13,7 +13,7 @@ from mathota_jax.collision.broadphase.pair_list import (
     PairList,
     Visit,
     collect,
-    finite_bounds,
+    stored_bounds,
 )
 
 CHUNK = 8192
@@ -22,7 +22,7 @@ CHUNK = 8192
 
 def all_pairs(bounds: Bounds, admissible: Admissible, capacity: int) -> PairList:
     """Candidate pairs by testing all; see `candidate_pairs`."""
-    bounds, bad = finite_bounds(bounds)
+    bounds, bad = stored_bounds(bounds)
     first, second = admissible.pairs
     return collect([_listed(first, second, bounds.radius)], bounds, bad, admissible, capacity, ordered=True)
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.spatial.indexing import gather
+from mathota_jax.spatial.indexing import gather_together
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.vector import Vec3
+from mathota_jax.spatial.vector import Vec3, dot
 
 LARGEST_SHAPE_COUNT = 46_340
 """Pairs are numbered ``first * count + second`` in int32."""
@@ -124,36 +124,40 @@ Enumerate = Callable[[Visit, tuple], tuple]
 """``enumerate(visit, carry) -> carry``: shows all possibly overlapping pairs, each once, to `visit`."""
 
 
-def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
-    """Bounds without derivative, evaluated once, those of bad shapes turned inside out; and which shapes are bad.
+def stored_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
+    """Bounds without derivative, evaluated once; and which shapes are bad, those of whose bounds some are not finite.
 
     Every method decides by comparing these numbers: were they computed again in each kernel, with other roundings, one
-    pair could come out both ways.
+    pair could come out both ways. What is infinite becomes NaN, so that bad shapes pass no test of `overlaps`.
     """
     bounds = jax.lax.stop_gradient(bounds)
     worlds = max(component.shape[-1] for component in (*bounds.low, *bounds.high, *bounds.center, bounds.radius))
     count = bounds.low.x.shape[0]
-    low, high, center, radius = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, worlds)), bounds)
-    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in (*low, *high, *center, radius)])
+    bounds = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, worlds)), bounds)
+    bounds = compute_once(bounds, bounds.radius)
+    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in jax.tree.leaves(bounds)])
+    return bounds, ~finite
+
+
+def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
+    """`stored_bounds`, those of bad shapes turned inside out."""
+    (low, high, center, radius), bad = stored_bounds(bounds)
+    finite = ~bad
     largest = float(jnp.finfo(radius.dtype).max)
     low, high = low.map(lambda x: jnp.where(finite, x, largest)), high.map(lambda x: jnp.where(finite, x, -largest))
     center, radius = center.map(lambda x: jnp.where(finite, x, 0.0)), jnp.where(finite, radius, 0.0)
-    return compute_once(Bounds(low, high, center, radius), radius), ~finite
+    return Bounds(low, high, center, radius), bad
 
 
 def overlaps(bounds: Bounds, first: Array, second: Array) -> tuple[Array, Array]:
     """Whether boxes and spheres overlap (guide 5.2 and 5.3), and by how much the boxes do along the best axis [m]."""
-    depth = None
-    for low, high in zip(bounds.low, bounds.high, strict=True):
-        top = jnp.minimum(gather(high, first), gather(high, second))
-        along = top - jnp.maximum(gather(low, first), gather(low, second))
-        depth = along if depth is None else jnp.minimum(depth, along)
-    assert depth is not None
-    squared = jnp.zeros(())
-    for center in bounds.center:
-        between = gather(center, second) - gather(center, first)
-        squared = squared + between * between
-    reach = (gather(bounds.radius, first) + gather(bounds.radius, second)) * (1.0 + SPHERE_MARGIN)
+    one, other = gather_together(bounds, first), gather_together(bounds, second)
+    top, bottom = jax.tree.map(jnp.minimum, one.high, other.high), jax.tree.map(jnp.maximum, one.low, other.low)
+    along = top - bottom
+    depth = jnp.minimum(jnp.minimum(along.x, along.y), along.z)
+    between = other.center - one.center
+    squared = dot(between, between)
+    reach = (one.radius + other.radius) * (1.0 + SPHERE_MARGIN)
     # A subtraction is negative, zero or positive exactly when the comparison says so.
     return (depth >= 0) & (squared <= reach * reach), depth
 
@@ -165,7 +169,7 @@ def collect(
 
     Args:
       enumerators: together show each pair at most once, and every pair whose boxes overlap.
-      bounds, bad: from `finite_bounds`.
+      bounds, bad: from `stored_bounds` or `finite_bounds`.
       admissible: which pairs may collide.
       capacity: places of the list.
       ordered: whether the enumerators show pairs in ascending order already.
