@@ -155,7 +155,7 @@ def _closest_points(frame: BoxFrame, crossing: _EdgeContact, size: Array) -> _Cl
         Vec3(*(side * half for side, half in zip(_deepest_corner_sides(frame), frame.incident_half, strict=True)))
     )
     start = lax.stop_gradient(where(frame.edge, crossing.point_b, corner))
-    on_b = _onto_incident(frame, clamp_to_box(start, frame.half))
+    on_b = compute_once(_onto_incident(frame, clamp_to_box(start, frame.half)), size)
     on_a = clamp_to_box(on_b, frame.half)
     difference = on_b - on_a
     squared = dot(difference, difference)
