@@ -43,7 +43,7 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     c = relative_rotation(pose_a.rotation, pose_b.rotation)
     t, t_b = pose_a.rotation.apply_transposed(between), pose_b.rotation.apply_transposed(between)
     code = best_axis(c, t, t_b, half_a, half_b, size)
-    frame = box_frame(code, c, t, t_b, pose_a, half_a, pose_b, half_b)
+    frame = box_frame(code, pose_a, half_a, pose_b, half_b)
 
     clipped = clip_incident_face(frame, size)
     crossing = _edge_contact(frame)
