@@ -260,7 +260,7 @@ def rows_one_by_one(
     return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
 
 
-def _unpacked(directions: Array, sign: float | Array) -> tuple[Vec3, ...]:
+def _unpacked(directions: Array, sign: float | np.ndarray | Array) -> tuple[Vec3, ...]:
     """Components (turn * column, world) of each row of what `pack_directions` gave, times a sign."""
     turns, rows, _, columns, worlds = directions.shape
     entries = unstack(directions.reshape(turns, 3 * rows, columns, worlds), 1)
