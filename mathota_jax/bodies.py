@@ -94,6 +94,12 @@ class InverseInertia(NamedTuple):
         return along + Vec3(xy * torque.y + xz * torque.z, xy * torque.x + yz * torque.z, xz * torque.x + yz * torque.y)
 
 
+def unpack_inverse(entries: Sequence[Array]) -> InverseInertia:
+    """From its entries in order: inverse mass, diagonal and products."""
+    mass, *inverse = entries
+    return InverseInertia(mass, Vec3(*inverse[:3]), Vec3(*inverse[3:]) if inverse[3:] else None)
+
+
 class Bodies(NamedTuple):
     """All bodies, static ones included; components of shape (body, world)."""
 

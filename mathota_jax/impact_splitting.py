@@ -94,7 +94,7 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
         for group, none in zip(problem.contact_rows, dropped, strict=True)
     ]
     problem = problem._replace(contact_rows=contact_rows)
-    start = starting_impulses(model, state, problem, inertia, packed)
+    start, _ = starting_impulses(model, state, problem, inertia, packed)
     joint_count = len(problem.joint_rows)
     start = start[:joint_count] + tuple(
         jnp.where(none, 0.0, impulse) for impulse, none in zip(start[joint_count:], dropped, strict=True)

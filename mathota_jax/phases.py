@@ -65,9 +65,14 @@ def gravity(model: Model) -> Vec3:
 
 
 def solve_rows(
-    scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...], known: bool = False
+    scene: Scene,
+    problem: Problem,
+    velocity: Array,
+    start: tuple[Array, ...],
+    change: Array | None = None,
+    known: bool = False,
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
-    """Phase 5: velocity constraints, unless `start` is `known` to solve them.
+    """Phase 5: velocity constraints, unless `start` is `known` to solve them; `change` is what it does to the velocity.
 
     Also 1 for each world (world,) that was not solved; None from "pgs".
     """
@@ -75,9 +80,9 @@ def solve_rows(
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
     if problem.held is None:
-        solved, impulses, failed = _sweep(scene, rows, velocity, start, known)
+        solved, impulses, failed = _sweep(scene, rows, velocity, start, known, change)
         if scene.rebounds_together and not known:
-            again = functools.partial(_impulses, scene, velocity, start)
+            again = functools.partial(_impulses, scene, velocity, start, change)
             contacts = tuple(problem.contact_rows)
             solved, impulses = rebound_limit.limit(again, problem.joint_rows, contacts, velocity, solved, impulses)
         return solved, impulses, failed
@@ -115,19 +120,26 @@ def _solve_mechanisms(
     return moved, (*joints, *others), failed
 
 
-def _impulses(scene: Scene, velocity: Array, start: tuple[Array, ...], rows: tuple[Rows, ...]) -> tuple[Array, ...]:
-    return _sweep(scene, rows, velocity, start, known=False)[1]
+def _impulses(
+    scene: Scene, velocity: Array, start: tuple[Array, ...], change: Array | None, rows: tuple[Rows, ...]
+) -> tuple[Array, ...]:
+    return _sweep(scene, rows, velocity, start, False, change)[1]
 
 
 def _sweep(
-    scene: Scene, rows: tuple[Rows, ...], velocity: Array, start: tuple[Array, ...], known: bool
+    scene: Scene,
+    rows: tuple[Rows, ...],
+    velocity: Array,
+    start: tuple[Array, ...],
+    known: bool,
+    change: Array | None = None,
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """All rows by the solver of the scene."""
     if scene.options.solver == "converged":
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
     sweeps = 0 if known else iterations
-    return *pgs.solve(sweeps, _gradient_iterations(scene, rows, iterations), rows, velocity, start), None
+    return *pgs.solve(sweeps, _gradient_iterations(scene, rows, iterations), rows, velocity, start, change), None
 
 
 def _gradient_iterations(scene: Scene, rows: tuple[Rows, ...], iterations: int) -> int:
@@ -185,7 +197,7 @@ def correct_positions(
     else:
         iterations = options.position_iterations
         gradient = _gradient_iterations(scene, tuple(rows), iterations)
-        correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start)
+        correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start, zero)
     return displace(moved, inertia, correction if back is None else correction + back)
 
 

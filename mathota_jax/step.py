@@ -158,14 +158,14 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
     problem = constrain(model, state, bodies, blocks, acting, free, carried, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
     if known is not None:
-        start = known_impulses(model, problem, known)
+        start, change = known_impulses(model, problem, known), None
     else:
-        start = starting_impulses(model, state, problem, acting, packed)
+        start, change = starting_impulses(model, state, problem, acting, packed)
     lever, beyond, gained, failed, last = None, None, None, None, None
     if scene.options.solver == "soft_step":
         solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
-        solved, impulses, failed = solve_rows(scene, problem, packed, start, known is not None)
+        solved, impulses, failed = solve_rows(scene, problem, packed, start, change, known is not None)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, beyond, gained)
     moved, displacement = compute_once((moved, displacement), state.position)

@@ -50,9 +50,7 @@ class BoxFrame(NamedTuple):
     incident_half: Vec3
 
 
-def box_frame(
-    code: Array, c: list[list[Array]], t: Vec3, t_b: Vec3, pose_a: Pose, half_a: Vec3, pose_b: Pose, half_b: Vec3
-) -> BoxFrame:
+def box_frame(code: Array, pose_a: Pose, half_a: Vec3, pose_b: Pose, half_b: Vec3) -> BoxFrame:
     """Builds the frame for the axis `code` of `best_axis`. Differentiable in all but the code."""
     assert pose_a.rotation is not None
     assert pose_b.rotation is not None
@@ -63,24 +61,20 @@ def box_frame(
     edge_row = (edge_index >= 3).astype(jnp.int32) + (edge_index >= 6)
     axis = jnp.where(edge, edge_row, jnp.where(reference_b, index - 3, index))
     outward = jnp.where(edge, 1, (reverse == reference_b).astype(jnp.int32))
-    sign = (2 * outward - 1).astype(t.x.dtype)
+    sign = (2 * outward - 1).astype(half_a.x.dtype)
 
-    rows = [Vec3(*(jnp.where(reference_b, c[j][i], c[i][j]) for j in range(3))) for i in range(3)]
-    center = [jnp.where(reference_b, -q, p) for p, q in zip(t, t_b, strict=True)]
     half = [jnp.where(reference_b, q, p) for p, q in zip(half_a, half_b, strict=True)]
     other_half = [jnp.where(reference_b, p, q) for p, q in zip(half_a, half_b, strict=True)]
-    columns = [_pick(reference_b, p, q) for p, q in zip(pose_a.rotation, pose_b.rotation, strict=True)]
+    columns = Mat3(*(_pick(reference_b, p, q) for p, q in zip(pose_a.rotation, pose_b.rotation, strict=True)))
+    others = Mat3(*(_pick(reference_b, q, p) for p, q in zip(pose_a.rotation, pose_b.rotation, strict=True)))
+    origin = _pick(reference_b, pose_a.position, pose_b.position)
+    other_origin = _pick(reference_b, pose_b.position, pose_a.position)
 
-    row_u, row_v, row_w = (Vec3(*(_cyclic(axis, shift, [r[j] for r in rows]) for j in range(3))) for shift in (1, 2, 0))
-    row_w = row_w * sign
-    axis_u, axis_v, axis_w = (
-        Vec3(*(_cyclic(axis, shift, [v[j] for v in columns]) for j in range(3))) for shift in (1, 2, 0)
-    )
-
-    incident_code = _incident(row_w, edge, edge_index - 3 * edge_row)
+    axis_u, axis_v, axis_w = (_column(axis, shift, columns) for shift in (1, 2, 0))
+    basis = compute_once(Mat3(axis_u, axis_v, axis_w * sign), code)
+    incident_code = _incident(others.apply_transposed(basis.column_z), edge, edge_index - 3 * edge_row)
     first = incident_code >> 1
-    incident = Mat3(*(Vec3(*(_cyclic(first, shift, list(row)) for row in (row_u, row_v, row_w))) for shift in range(3)))
-    incident = compute_once(incident, incident_code)
+    incident = Mat3(*(basis.apply_transposed(_column(first, shift, others)) for shift in range(3)))
     return BoxFrame(
         edge=edge,
         reference_b=reference_b,
@@ -89,12 +83,10 @@ def box_frame(
         outward=outward,
         incident_axis=first,
         incident_outward=incident_code & 1,
-        origin=_pick(reference_b, pose_a.position, pose_b.position),
-        basis=compute_once(Mat3(axis_u, axis_v, axis_w * sign), incident_code),
-        center=compute_once(
-            Vec3(_cyclic(axis, 1, center), _cyclic(axis, 2, center), _cyclic(axis, 0, center) * sign), incident_code
-        ),
-        incident=incident,
+        origin=origin,
+        basis=basis,
+        center=compute_once(basis.apply_transposed(other_origin - origin), code),
+        incident=compute_once(incident, code),
         half=Vec3(_cyclic(axis, 1, half), _cyclic(axis, 2, half), _cyclic(axis, 0, half)),
         incident_half=Vec3(*(_cyclic(first, shift, other_half) for shift in range(3))),
     )
@@ -102,6 +94,11 @@ def box_frame(
 
 def _pick(condition: Array, otherwise: Vec3, value: Vec3) -> Vec3:
     return Vec3(*(jnp.where(condition, q, p) for p, q in zip(otherwise, value, strict=True)))
+
+
+def _column(axis: Array, shift: int, columns: Mat3) -> Vec3:
+    """Column ``(axis + shift) % 3``."""
+    return Vec3(*(_cyclic(axis, shift, [column[j] for column in columns]) for j in range(3)))
 
 
 def _cyclic(axis: Array, shift: int, values: list[Any]) -> Array:

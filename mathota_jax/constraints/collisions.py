@@ -181,7 +181,7 @@ def _rounds(
                 dataclasses.replace(row, bias=row.bias + share * rebound)
                 for row, rebound in zip(rows, rebounds, strict=True)
             )
-            return pgs.solve(iterations, gradient, biased, velocity, start)[1]
+            return pgs.solve(iterations, gradient, biased, velocity, start, jnp.zeros_like(velocity))[1]
 
         if scene.friction:
             both = lax.map(with_restitution, jnp.array([0.0, 1.0], velocity.dtype))

@@ -212,28 +212,9 @@ def _previous_places(scene: Scene, found: PairList, pair: Array) -> Array:
 def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     """Gives every listed pair a turn and a column."""
     block_count, capacity = len(scene.dynamic_bodies), found.first.shape[0]
-    group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
-    active = found.active
     turn_counts = [sum(tier.turn_count for tier in group.tiers) for group in scene.compact_groups]
-    turn_count = max(turn_counts)
-    assert scene.broadphase is not None
-    if scene.broadphase.one_by_one:
-        colour = _ranks(group_of_pair, active, len(turn_counts))
-    else:
-        blocks = _blocks(scene)
-        ends = [blocks[side] for side in (found.first, found.second)]
-        node_count = len(scene.compact_groups) * block_count
-        nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
-        priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
-        colour = edge_colours(nodes, priority, active, node_count, turn_count)  # type: ignore[arg-type]
-
-    # Sorted by group, turn and place in the list: the pairs of a turn follow one another.
-    code = jnp.where(active, group_of_pair * (turn_count + 1) + colour, len(turn_counts) * (turn_count + 1))
-    worlds = code.shape[-1]
-    sorted_pairs = jnp.sort(code * capacity + jnp.arange(capacity, dtype=jnp.int32)[:, None], axis=0) % capacity
-    counts = jnp.zeros((len(turn_counts) * (turn_count + 1), worlds), jnp.int32)
-    counts = counts.at[code, jnp.arange(worlds)].add(1, mode="drop")
-    starts = jnp.cumsum(counts, axis=0) - counts
+    turn_count, worlds = max(turn_counts), found.active.shape[-1]
+    sorted_pairs, counts, starts = _turns(scene, found, turn_counts)
 
     groups, lost, slot = [], jnp.zeros(worlds, bool), scene.static_slot_count
     for number, group in enumerate(scene.compact_groups):
@@ -256,6 +237,39 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
         lost |= (counts[turn + turn_counts[number] : turn + turn_count + 1] > 0).any(0)
         groups.append(_group_places(scene, group, found, jnp.concatenate(held), jnp.concatenate(listed), tables, sizes))
     return groups, lost
+
+
+def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array, Array, Array]:
+    """Listed pairs sorted by turn, those of all groups; how many each turn holds, and where in the order they begin.
+
+    Each group has one turn more than it has places for: what is there is lost.
+    """
+    turn_count, capacity, active = max(turn_counts), found.first.shape[0], found.active
+    assert scene.broadphase is not None
+    if scene.broadphase.one_by_one and len(scene.compact_groups) == 1:
+        # The list has no gaps: each pair has the turn of its own number.
+        order, turns = jnp.arange(capacity, dtype=jnp.int32), jnp.arange(turn_count + 1, dtype=jnp.int32)[:, None]
+        counts = (turns < found.count).astype(jnp.int32)
+        return jnp.broadcast_to(order[:, None], active.shape), counts, jnp.broadcast_to(turns, counts.shape)
+    group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
+    if scene.broadphase.one_by_one:
+        colour = _ranks(group_of_pair, active, len(turn_counts))
+    else:
+        blocks = _blocks(scene)
+        ends = [blocks[side] for side in (found.first, found.second)]
+        block_count = len(scene.dynamic_bodies)
+        node_count = len(scene.compact_groups) * block_count
+        nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
+        priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
+        colour = edge_colours(nodes, priority, active, node_count, turn_count)  # type: ignore[arg-type]
+
+    # Sorted by group, turn and place in the list: the pairs of a turn follow one another.
+    code = jnp.where(active, group_of_pair * (turn_count + 1) + colour, len(turn_counts) * (turn_count + 1))
+    worlds = code.shape[-1]
+    sorted_pairs = jnp.sort(code * capacity + jnp.arange(capacity, dtype=jnp.int32)[:, None], axis=0) % capacity
+    counts = jnp.zeros((len(turn_counts) * (turn_count + 1), worlds), jnp.int32)
+    counts = counts.at[code, jnp.arange(worlds)].add(1, mode="drop")
+    return sorted_pairs, counts, jnp.cumsum(counts, axis=0) - counts
 
 
 def _blocks(scene: Scene) -> Array:

@@ -9,7 +9,6 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -39,7 +38,7 @@ from mathota_jax.solver.row_matrix import Points
 from mathota_jax.solver.rows import Places, Rows, matrix_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
@@ -218,7 +217,8 @@ def _points(
     angular, inertias = [], []
     for side, sign in enumerate(signs):
         position, inertia = select_blocks(table, side, (motion.position, motion.inertia), places)
-        inertias.append(jax.tree.map(functools.partial(_of_constraints, table), inertia))
+        entries = [_of_constraints(table, entry, worlds) for entry in jax.tree.leaves(inertia)]
+        inertias.append(jnp.stack(entries, axis=1))
         if not couples_rotation(scene):
             continue
         # Where there still is a gap, the arm ends on the body's own surface, as it will when the gap has closed.
@@ -228,10 +228,10 @@ def _points(
     return Points(packed, tuple(angular), tuple(inertias))
 
 
-def _of_constraints(table: Table | TracedTable, values: Array) -> Array:
+def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> Array:
     """(turn, constraint, world) from the same value (turn * column, world) in all columns of a constraint."""
-    values = jnp.broadcast_to(values, (table.turn_count * table.column_count, values.shape[-1]))
-    return values.reshape(table.turn_count, -1, table.together, values.shape[-1])[:, :, 0]
+    values = jnp.broadcast_to(values, (table.turn_count * table.column_count, worlds))
+    return values.reshape(table.turn_count, -1, table.together, worlds)[:, :, 0]
 
 
 def rows_one_by_one(
@@ -249,11 +249,23 @@ def rows_one_by_one(
         chosen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), chosen)
         part = dataclasses.replace(table, turn_count=blocks[0].shape[0], first_slot=0)
         found = contact_rows(scene, part, model, chosen, motion, pairs._replace(places=Places(blocks, None)))
-        return found._replace(rows=dataclasses.replace(found.rows, places=None))
+        found = found._replace(rows=dataclasses.replace(found.rows, places=None))
+        return found._replace(directions=()) if isinstance(found.rows.matrix, Points) else found
 
     chosen = jax.tree.map(by_turn, select(table, contacts))
     found = map_filled(rows, (chosen, blocks, pairs._replace(places=None)), turns)
+    if isinstance(found.rows.matrix, Points):
+        sign = 1.0 if pairs.sign is None else _signs(scene, table, pairs)[0]
+        found = found._replace(directions=_unpacked(found.rows.matrix.directions, sign))
     return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
+
+
+def _unpacked(directions: Array, sign: float | np.ndarray | Array) -> tuple[Vec3, ...]:
+    """Components (turn * column, world) of each row of what `pack_directions` gave, times a sign."""
+    turns, rows, _, columns, worlds = directions.shape
+    entries = unstack(directions.reshape(turns, 3 * rows, columns, worlds), 1)
+    flat = [entry.reshape(-1, worlds) * sign for entry in entries]
+    return tuple(Vec3(*flat[3 * row : 3 * row + 3]) for row in range(rows))
 
 
 def _push_only(effective_mass: Array) -> Push:

@@ -31,10 +31,14 @@ def entries_of(matrix: Dense) -> tuple[Entries, Entries]:
     """Entries of Jacobian and response for the bounds below."""
     # The length of a step does not move the fixed point: its derivative is not worth computing.
     matrix = jax.lax.stop_gradient(matrix)
-    jacobian, response = (
-        [[unstack(row, 1) for row in unstack(side, 1)] for side in sides]
-        for sides in (matrix.jacobian, matrix.response)
-    )
+
+    def of_side(side: Array) -> list[list[Array]]:
+        # One slice each: of a slice of a slice, XLA makes a kernel.
+        turns, rows, components, *rest = side.shape
+        entries = unstack(side.reshape(turns, rows * components, *rest), 1)
+        return [entries[components * row : components * (row + 1)] for row in range(rows)]
+
+    jacobian, response = ([of_side(side) for side in sides] for sides in (matrix.jacobian, matrix.response))
     return jacobian, response
 
 

@@ -135,18 +135,21 @@ def constrain(
 
 def starting_impulses(
     model: Model, state: State, problem: Problem, inertia: Inertia, velocity: Array
-) -> tuple[Array, ...]:
-    """Impulses to start from: those of the last step where rows and features are the same (guide 12.4)."""
+) -> tuple[tuple[Array, ...], Array | None]:
+    """Impulses to start from: those of the last step where rows and features are the same (guide 12.4).
+
+    Also what they do to the velocities (component, block, world), where that is known.
+    """
     if not model.scene.options.warm_start:
-        return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
+        return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows), jnp.zeros_like(velocity)
     last = state if state.end_forces is None else state.end_forces
     if problem.contacts is None:
-        return _impulses(model, problem, last.joint_force, None)
+        return _impulses(model, problem, last.joint_force, None), None
     force = matched_force(model.scene, problem.contacts, problem.close, state, last.contact_force)
     start = _impulses(model, problem, last.joint_force, compute_once(force, state.position))
     if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
         return warm_start.plausible(problem.rows, inertia, velocity, start)
-    return start
+    return start, None
 
 
 def known_impulses(model: Model, problem: Problem, solved: Forces) -> tuple[Array, ...]:

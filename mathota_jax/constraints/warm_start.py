@@ -58,8 +58,10 @@ def join_forces(parts: list[Vec3]) -> Vec3:
     return Vec3(*(jnp.concatenate(components) for components in zip(*parts, strict=True)))
 
 
-def plausible(rows: tuple[Rows, ...], inertia: Inertia, velocity: Array, start: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Impulses to start from, shortened in a world that would be better off without them.
+def plausible(
+    rows: tuple[Rows, ...], inertia: Inertia, velocity: Array, start: tuple[Array, ...]
+) -> tuple[tuple[Array, ...], Array]:
+    """Impulses to start from, shortened in a world that would be better off without them, and what they do to velocities.
 
     The impulses of an impact are not those of the next step. Where bodies of unequal mass touch, a few sweeps do not undo
     them, and from step to step they would grow. The solver minimises ``phi = b x + x A x / 2``, 0 without impulses: where
@@ -81,7 +83,8 @@ def plausible(rows: tuple[Rows, ...], inertia: Inertia, velocity: Array, start: 
     slope, curvature = compute_once((slope, _total(change * momentum)), velocity)
     worse = slope + 0.5 * curvature > 0
     scale = jnp.where(worse, jnp.clip(safe_divide(-slope, curvature), 0.0, 1.0), 1.0)
-    return tuple(lax.stop_gradient(impulse * scale) for impulse in start)  # the start does not move the solution
+    # The start does not move the solution.
+    return lax.stop_gradient((tuple(impulse * scale for impulse in start), change * scale))
 
 
 def _total(terms: Array) -> Array:

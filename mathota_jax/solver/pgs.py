@@ -74,7 +74,12 @@ def enough_for_derivatives(rows: tuple[Rows, ...], iterations: int) -> int:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def solve(
-    iterations: int, gradient_iterations: int, rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]
+    iterations: int,
+    gradient_iterations: int,
+    rows: tuple[Rows, ...],
+    velocity: Array,
+    impulses: tuple[Array, ...],
+    change: Array | None = None,
 ) -> tuple[Array, tuple[Array, ...]]:
     """Runs a fixed number of sweeps.
 
@@ -84,11 +89,12 @@ def solve(
       rows: groups of rows, solved in this order within a sweep.
       velocity: (component, block, world) without any constraint impulse.
       impulses: for each group (turn, row, column, world), the impulses to start from.
+      change: (component, block, world) what they make of the velocity, without derivative; None if it is not known yet.
 
     Returns:
       The velocity with the impulses, and the impulses.
     """
-    velocity = add_impulses(rows, velocity, impulses)
+    velocity = add_impulses(rows, velocity, impulses) if change is None else velocity + change
     if not rows or not iterations:
         return compute_once((velocity, impulses), velocity)
     biases = tuple(group.bias for group in rows)
@@ -201,9 +207,9 @@ def _turn(
 
 @solve.defjvp
 def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangents: tuple) -> tuple:
-    rows, velocity, impulses = primals
-    d_rows, d_velocity, _ = tangents
-    velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses)
+    rows, velocity, impulses, change = primals
+    d_rows, d_velocity, _, _ = tangents
+    velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses, change)
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
     rows, d_rows = _dense(rows, d_rows)

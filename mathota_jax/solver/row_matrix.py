@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import InverseInertia
+from mathota_jax.bodies import InverseInertia, unpack_inverse
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
@@ -67,12 +67,18 @@ class Points:
     Attributes:
       directions: in which side B moves against side A; of the only side with its sign.
       angular: for each side, its sign times (arm x direction); none where nothing couples to rotation.
-      inertia: for each side, components (turn, constraint, world).
+      packed_inertia: for each side, the entries of its inverse inertia (turn, entry, constraint, world) in one array, of
+        which loops have a kernel each.
     """
 
     directions: Array
     angular: tuple[Array, ...]
-    inertia: tuple[InverseInertia, ...]
+    packed_inertia: tuple[Array, ...]
+
+    @property
+    def inertia(self) -> tuple[InverseInertia, ...]:
+        """For each side, components (..., constraint, world)."""
+        return tuple(unpack_inverse(unstack(side, -3)) for side in self.packed_inertia)
 
     @property
     def like(self) -> Array:
@@ -81,7 +87,7 @@ class Points:
 
     @property
     def _signs(self) -> tuple[float, ...]:
-        return (-1.0, 1.0)[-len(self.inertia) :]
+        return (-1.0, 1.0)[-len(self.packed_inertia) :]
 
     def rates(self, velocities: Sequence[Array]) -> Array:
         """As `Dense.rates`."""
@@ -119,11 +125,11 @@ class Points:
     def stored(self) -> Points:
         """The same, computed once."""
         directions, angular = compute_once((self.directions, self.angular), self.like)
-        return Points(directions, angular, self.inertia)
+        return Points(directions, angular, self.packed_inertia)
 
     def first_row(self) -> Points:
         """As `Dense.first_row`."""
-        return Points(self.directions[:, :1], tuple(side[:, :1] for side in self.angular), self.inertia)
+        return Points(self.directions[:, :1], tuple(side[:, :1] for side in self.angular), self.packed_inertia)
 
     def dense(self) -> Dense:
         """The same rows with all entries. Stored: each product, and each cotangent, would compute them again."""

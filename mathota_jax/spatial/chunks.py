@@ -53,9 +53,13 @@ def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used:
     """`function(chunk, *constants)` of the chunks in use, stacked, and 0 elsewhere."""
 
     def body(k: Array, results: Any) -> Any:
-        chunk = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, k, 0, keepdims=False), chunks)
+        chunk = jax.tree.map(
+            lambda x: lax.dynamic_index_in_dim(x, k, 0, keepdims=False, allow_negative_indices=False), chunks
+        )
         return jax.tree.map(
-            lambda all_, x: lax.dynamic_update_index_in_dim(all_, x, k, 0), results, function(chunk, *constants)
+            lambda all_, x: lax.dynamic_update_index_in_dim(all_, x, k, 0, allow_negative_indices=False),
+            results,
+            function(chunk, *constants),
         )
 
     chunk = jax.tree.map(lambda x: x[0], chunks)

@@ -106,25 +106,32 @@ def incline() -> dict:
 
 
 def tipping() -> dict:
-    """A10, tip variant: the slope in steps of half a degree at which a tall box falls over."""
-    half = (0.1, 0.4, 0.1)
-    fallen, cpu_total = [], 0.0
-    angles = np.arange(10, 20.01, 0.5)
-    for degrees in angles:
-        model, state = _on_plane(Box(half), 0.4, 1.5, slope=math.radians(degrees))
+    """A10, tip variant: the slope at which a tall box falls over, by half degrees, then by bisection."""
+    grid, halvings = np.arange(10, 20.01, 0.5), 6
+    cpu_total = 0.0
+
+    def falls(degrees: float) -> bool:
+        nonlocal cpu_total
+        model, state = _on_plane(Box((0.1, 0.4, 0.1)), 0.4, 1.5, slope=math.radians(degrees))
         track, cpu = _track(model, state, round(3 / TIME_STEP))
         cpu_total += cpu
         turn = 2 * np.arccos(np.clip(np.abs(np.asarray(track.orientation[-1, BODY] @ state.orientation[BODY])), 0, 1))
-        fallen.append(math.degrees(turn) > 10)
-    steepest_standing = max(angles[~np.array(fallen)], default=math.nan)
-    gentlest_fallen = min(angles[np.array(fallen)], default=math.nan)
-    middle = 0.5 * (steepest_standing + gentlest_fallen)
+        return math.degrees(turn) > 10
+
+    fallen = np.array([falls(degrees) for degrees in grid])
+    stands_at = max(grid[~fallen], default=math.nan)
+    falls_at = min(grid[fallen], default=math.nan)
+    monotone = stands_at < falls_at  # False for nan
+    for _ in range(halvings if monotone else 0):
+        middle = 0.5 * (stands_at + falls_at)
+        stands_at, falls_at = (stands_at, middle) if falls(middle) else (middle, falls_at)
+    found = 0.5 * (stands_at + falls_at) if monotone else math.nan
     return {
-        "tipping angle, error [deg]": _gate(abs(middle - math.degrees(math.atan(0.25))), 0.25),
+        "tipping angle, error [deg]": _gate(abs(found - math.degrees(math.atan(0.25))), 0.25),
         "settings": {
             "dt": TIME_STEP,
-            "stands at": steepest_standing,
-            "falls at": gentlest_fallen,
+            "grid [deg]": f"{grid[0]:g} to {grid[-1]:g} by {grid[1] - grid[0]:g}, its last interval halved {halvings} times",
+            "found [deg]": f"{found:.3f} +- {0.5 * (falls_at - stands_at):.3f}",
             "precision": "float32",
         },
         "cpu_seconds": cpu_total,

@@ -13,7 +13,7 @@ from mathota_jax.collision.broadphase.pair_list import (
     Visit,
     collect,
 )
-from mathota_jax.collision.broadphase.volumes import Bounds, finite_bounds
+from mathota_jax.collision.broadphase.volumes import Bounds, stored_bounds
 
 CHUNK = 8192
 """Pairs tested at a time, so that the memory does not grow with the square of the number of shapes."""
@@ -21,7 +21,7 @@ CHUNK = 8192
 
 def all_pairs(bounds: Bounds, admissible: Admissible, capacity: int) -> PairList:
     """Candidate pairs by testing all; see `candidate_pairs`."""
-    bounds, bad = finite_bounds(bounds)
+    bounds, bad = stored_bounds(bounds)
     first, second = (side[admissible.pairs[0] >= bounds.plane_count] for side in admissible.pairs)
     return collect([_listed(first, second, bounds.radius)], bounds, bad, admissible, capacity, ordered=True)
 

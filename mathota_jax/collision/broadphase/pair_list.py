@@ -117,7 +117,7 @@ def collect(
 
     Args:
       enumerators: together show each pair at most once, and every pair whose boxes overlap; no planes.
-      bounds, bad: from `finite_bounds`. Pairs of planes, if there are any, are found here.
+      bounds, bad: from `stored_bounds` or `finite_bounds`. Pairs of planes, if there are any, are found here.
       admissible: which pairs may collide.
       capacity: places of the list.
       ordered: whether the enumerators show pairs in ascending order already.

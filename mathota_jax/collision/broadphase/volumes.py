@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.spatial.indexing import gather
+from mathota_jax.spatial.indexing import gather_together
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, dot
 
@@ -45,38 +45,41 @@ class Bounds(NamedTuple):
         return 0 if self.planes is None else self.planes.offset.shape[0]
 
 
-def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
-    """Bounds without derivative, evaluated once, those of bad shapes turned inside out; and which shapes are bad.
+def stored_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
+    """Bounds without derivative, evaluated once; and which shapes are bad, those of whose bounds some are not finite.
 
     Every method decides by comparing these numbers: were they computed again in each kernel, with other roundings, one
-    pair could come out both ways.
+    pair could come out both ways. What is infinite becomes NaN, so that bad shapes pass no test of `overlaps`.
     """
-    low, high, center, radius, planes = jax.lax.stop_gradient(bounds)
-    worlds = max(component.shape[-1] for component in (*low, *high, *center, radius))
-    count = low.x.shape[0]
-    low, high, center, radius = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (count, worlds)), (low, high, center, radius)
-    )
-    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in (*low, *high, *center, radius)])
+    *volumes, planes = jax.lax.stop_gradient(bounds)
+    worlds = max(component.shape[-1] for component in jax.tree.leaves(volumes))
+    count = bounds.low.x.shape[0]
+    volumes = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, worlds)), volumes)
+    volumes = compute_once(volumes, volumes[-1])
+    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in jax.tree.leaves(volumes)])
+    return Bounds(*volumes, planes), ~finite
+
+
+def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
+    """`stored_bounds`, those of bad shapes turned inside out."""
+    (low, high, center, radius, planes), bad = stored_bounds(bounds)
+    finite = ~bad
     largest = float(jnp.finfo(radius.dtype).max)
     low, high = low.map(lambda x: jnp.where(finite, x, largest)), high.map(lambda x: jnp.where(finite, x, -largest))
     center, radius = center.map(lambda x: jnp.where(finite, x, 0.0)), jnp.where(finite, radius, 0.0)
-    return Bounds(*compute_once((low, high, center, radius), radius), planes), ~finite
+    return Bounds(low, high, center, radius, planes), bad
 
 
 def overlaps(bounds: Bounds, first: Array, second: Array) -> tuple[Array, Array]:
     """Whether boxes and spheres overlap (guide 5.2 and 5.3), and by how much the boxes do along the best axis [m]."""
-    depth = None
-    for low, high in zip(bounds.low, bounds.high, strict=True):
-        top = jnp.minimum(gather(high, first), gather(high, second))
-        along = top - jnp.maximum(gather(low, first), gather(low, second))
-        depth = along if depth is None else jnp.minimum(depth, along)
-    assert depth is not None
-    squared = jnp.zeros(())
-    for center in bounds.center:
-        between = gather(center, second) - gather(center, first)
-        squared = squared + between * between
-    reach = (gather(bounds.radius, first) + gather(bounds.radius, second)) * (1.0 + SPHERE_MARGIN)
+    volumes = bounds._replace(planes=None)
+    one, other = gather_together(volumes, first), gather_together(volumes, second)
+    top, bottom = jax.tree.map(jnp.minimum, one.high, other.high), jax.tree.map(jnp.maximum, one.low, other.low)
+    along = top - bottom
+    depth = jnp.minimum(jnp.minimum(along.x, along.y), along.z)
+    between = other.center - one.center
+    squared = dot(between, between)
+    reach = (one.radius + other.radius) * (1.0 + SPHERE_MARGIN)
     # A subtraction is negative, zero or positive exactly when the comparison says so.
     return (depth >= 0) & (squared <= reach * reach), depth
 

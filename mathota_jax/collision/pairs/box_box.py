@@ -43,7 +43,7 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     c = relative_rotation(pose_a.rotation, pose_b.rotation)
     t, t_b = pose_a.rotation.apply_transposed(between), pose_b.rotation.apply_transposed(between)
     code = best_axis(c, t, t_b, half_a, half_b, size)
-    frame = box_frame(code, c, t, t_b, pose_a, half_a, pose_b, half_b)
+    frame = box_frame(code, pose_a, half_a, pose_b, half_b)
 
     clipped = clip_incident_face(frame, size)
     crossing = _edge_contact(frame)
@@ -155,7 +155,7 @@ def _closest_points(frame: BoxFrame, crossing: _EdgeContact, size: Array) -> _Cl
         Vec3(*(side * half for side, half in zip(_deepest_corner_sides(frame), frame.incident_half, strict=True)))
     )
     start = lax.stop_gradient(where(frame.edge, crossing.point_b, corner))
-    on_b = _onto_incident(frame, clamp_to_box(start, frame.half))
+    on_b = compute_once(_onto_incident(frame, clamp_to_box(start, frame.half)), size)
     on_a = clamp_to_box(on_b, frame.half)
     difference = on_b - on_a
     squared = dot(difference, difference)
