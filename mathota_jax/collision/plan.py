@@ -28,6 +28,9 @@ one plane gains 6 %, and balls in a bin, with a point for each plane, lose as mu
 PAIRS_PER_SHAPE = 8
 """Close pairs for each moving shape: equal spheres have at most 6, boxes somewhat more, their bounds touch sooner."""
 
+FEWEST_PAIRS = 100
+"""Room for close pairs in scenes of few moving shapes, which may lie on many static ones."""
+
 ONE_BY_ONE_UP_TO = 300
 """Pairs up to which each has a turn of its own: worlds side by side keep the processor busy, and no place stays empty."""
 
@@ -68,18 +71,24 @@ def plan_broadphase(
         return None
     sizes = [reach[entries[k].body] for k in shapes]
     method = choose_method(moving, fixed, sizes) if options.broadphase == "auto" else options.broadphase
-    room = options.pair_capacity or max(PAIRS_PER_SHAPE * moving, ONE_BY_ONE_UP_TO)
     planes = [k for k, entry in enumerate(entries) if collides[entry.body] and entry.kind == "plane"]
     points = [PAIRS["plane", entries[k].kind].point_count for k in shapes if not static[entries[k].body]]
     many = len(planes) * sum(points) > OWN_PLANE_POINTS * moving
-    if many and room <= ONE_BY_ONE_UP_TO and not in_motion:
-        shapes, pair_count = planes + shapes, pair_count + moving * len(planes)
-    capacity = min(room, pair_count)
+    with_planes = pair_count + moving * len(planes)
+    if many and not in_motion and _capacity(with_planes, moving, options) <= ONE_BY_ONE_UP_TO:
+        shapes, pair_count = planes + shapes, with_planes
+    capacity = _capacity(pair_count, moving, options)
     one_by_one = capacity <= ONE_BY_ONE_UP_TO
     groups = _groups(
         [(entries[k].kind, static[entries[k].body]) for k in shapes], sizes, capacity if one_by_one else None
     )
     return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups, one_by_one)
+
+
+def _capacity(pair_count: int, moving: int, options: Options) -> int:
+    """Pairs that the list has room for; places that stay empty cost, in a pile of 27 boxes as much as those in use."""
+    everything = pair_count if pair_count <= ONE_BY_ONE_UP_TO else max(PAIRS_PER_SHAPE * moving, FEWEST_PAIRS)
+    return min(options.pair_capacity or everything, pair_count)
 
 
 def _groups(

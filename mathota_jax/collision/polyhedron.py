@@ -113,8 +113,12 @@ def face_normals(polyhedron: dict[str, Any]) -> Vec3:
 def polyhedron_surface(polyhedron: dict[str, Any]) -> tuple[PolyhedronFaces, Vec3, Vec3]:
     """Faces of the polyhedra of all pairs, and both ends of their edges, components (edge, pair, world)."""
     vertices = polyhedron.get("table", polyhedron["vertices"])
-    ends = edge_table(polyhedron["faces"])[:2]
-    found = polyhedron_faces(vertices, polyhedron["faces"]), *(take_vertices(vertices, end) for end in ends)
+    start, end, *_ = edge_table(polyhedron["faces"])
+    found = (
+        polyhedron_faces(vertices, polyhedron["faces"]),
+        take_vertices(vertices, start),
+        take_vertices(vertices, end),
+    )
     return gather_inner(found, polyhedron["row"]) if "row" in polyhedron else found
 
 

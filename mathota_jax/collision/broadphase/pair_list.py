@@ -135,9 +135,9 @@ def collect(
         return settle(jnp.where(kept, 1.0, 0.0)) > 0, low * count + high, depth
 
     def append(limit: tuple[Array, Array]) -> Callable:
-        def visit(carry: tuple, first: Array, second: Array, kept: Array, depth: Array | None = None) -> tuple:
+        def visit(carry: tuple, first: Array, second: Array, kept: Array, known: Array | None = None) -> tuple:
             keys, found, total = carry
-            hit, key, depth = hits(first, second, kept, depth)
+            hit, key, depth = hits(first, second, kept, known)
             shallowness = _shallowness(depth)
             listed = hit & ((shallowness < limit[0]) | ((shallowness == limit[0]) & (key <= limit[1])))
             place = found + jnp.cumsum(listed.astype(jnp.int32), axis=0) - 1
@@ -223,8 +223,8 @@ def _deepest(enumerators: Sequence[Enumerate], hits: Callable, capacity: int, wo
         shift = DIGIT_BITS * (DIGITS - 1 - turn % DIGITS)
         prefix = jnp.where(ties, key_limit, limit)
 
-        def visit(histogram: tuple, first: Array, second: Array, kept: Array, depth: Array | None = None) -> tuple:
-            hit, key, depth = hits(first, second, kept, depth)
+        def visit(histogram: tuple, first: Array, second: Array, kept: Array, known: Array | None = None) -> tuple:
+            hit, key, depth = hits(first, second, kept, known)
             shallowness = _shallowness(depth)
             code = jnp.where(ties, key, shallowness)
             hit = hit & (~ties | (shallowness == limit)) & ((code >> shift >> DIGIT_BITS) == prefix)

@@ -51,13 +51,13 @@ def stored_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
     Every method decides by comparing these numbers: were they computed again in each kernel, with other roundings, one
     pair could come out both ways. What is infinite becomes NaN, so that bad shapes pass no test of `overlaps`.
     """
-    *volumes, planes = jax.lax.stop_gradient(bounds)
+    low, high, center, radius, planes = jax.lax.stop_gradient(bounds)
+    volumes = (low, high, center, radius)
     worlds = max(component.shape[-1] for component in jax.tree.leaves(volumes))
-    count = bounds.low.x.shape[0]
-    volumes = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, worlds)), volumes)
-    volumes = compute_once(volumes, volumes[-1])
-    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in jax.tree.leaves(volumes)])
-    return Bounds(*volumes, planes), ~finite
+    volumes = jax.tree.map(lambda x: jnp.broadcast_to(x, (low.x.shape[0], worlds)), volumes)
+    low, high, center, radius = compute_once(volumes, volumes[-1])
+    finite = functools.reduce(jnp.logical_and, [jnp.isfinite(x) for x in (*low, *high, *center, radius)])
+    return Bounds(low, high, center, radius, planes), ~finite
 
 
 def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:

@@ -209,7 +209,7 @@ def _as_set(members: Sequence[Array], number: Any) -> Set:
     return [settle_code(functools.reduce(jnp.add, bits[start : start + BITS])) for start in range(0, len(bits), BITS)]
 
 
-def _untested(walls: _Walls, depth: Array, edges: Array) -> Set:
+def _untested(walls: _Walls, depth: Array, edges: Any) -> Set:
     """Edges (of each lane) such that no corner of the other polytope lies below both of their faces by `depth` or more."""
     # Summed in another order than in `_reach`: XLA would compute a sum that both need in a kernel for each corner.
     x, y, z = walls.inward
