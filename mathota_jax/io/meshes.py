@@ -159,14 +159,16 @@ def _closed_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if not path.is_file():
         raise FileNotFoundError(f"mesh file '{path}' does not exist")
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)
+        finite = bool(np.all(np.isfinite(mesh.vertices)))
+        mesh.process()  # merges the corners of an STL; it also drops vertices that are not finite, without a word
         vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32)
     except Exception as error:  # its parsers raise whatever they come across
         raise ValueError(f"mesh file '{path}' can not be read: {error}") from error
+    if not finite:
+        raise ValueError(f"mesh file '{path}' holds vertices that are not finite")
     if not len(triangles):
         raise ValueError(f"mesh file '{path}' is empty: it holds no triangle")
-    if not np.all(np.isfinite(vertices)):
-        raise ValueError(f"mesh file '{path}' holds vertices that are not finite")
     edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     count = np.unique(edges, axis=0, return_counts=True)[1]
     if np.any(count != 2):

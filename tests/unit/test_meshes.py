@@ -103,6 +103,9 @@ def test_bad_files_are_named(trimesh, tmp_path):
     fin.export(tmp_path / "fin.obj")
     with pytest.raises(ValueError, match=r"fin\.obj' is not a closed \(manifold\) surface"):
         load_mesh(tmp_path / "fin.obj")
+    (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
+    with pytest.raises(ValueError, match=r"nan\.obj' holds vertices that are not finite"):
+        load_mesh(tmp_path / "nan.obj")
     with pytest.raises(ValueError, match="scale must be a positive"):
         load_mesh(tmp_path / "fin.obj", scale=-1.0)
 
