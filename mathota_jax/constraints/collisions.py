@@ -25,6 +25,7 @@ from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
 from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.problem import Problem
+from mathota_jax.constraints.rebound_limit import share_without_gain
 from mathota_jax.model import Model
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
@@ -32,7 +33,6 @@ from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, matrix_velocity, row_velocity
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
-from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
 
@@ -224,9 +224,7 @@ def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, f
         slope = slope + (more * middle).sum((0, 1, 2))
         bend = bend + (more * (after - middle)).sum((0, 1, 2))
     gains = settle(jnp.where(slope + 0.5 * bend > lost, 1.0, 0.0)) > 0.5
-    lost = jnp.maximum(lost, 0.0)
-    root = safe_sqrt(jnp.where(gains, jnp.maximum(slope * slope + 2.0 * bend * lost, 0.0), 1.0))
-    share = jnp.where(gains, jnp.clip(safe_divide(2.0 * lost, slope + root), 0.0, 1.0), 1.0)
+    share = share_without_gain(gains, lost, slope, bend)
     return tuple(first + share * more for first, more in zip(stopping, difference, strict=True))
 
 

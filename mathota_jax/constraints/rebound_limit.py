@@ -55,8 +55,7 @@ def limit(
         stopping = solve((*joints, *inelastic))
         stopped = add_impulses(rows, velocity, stopping)
         more = tuple(last - first for first, last in zip(stopping, impulses, strict=True))
-        share = _share(contacts, velocity, stopped, solved, stopping[len(joints) :], more[len(joints) :])
-        share = jnp.where(gains, share, 1.0)
+        share = _share(gains, contacts, velocity, stopped, solved, stopping[len(joints) :], more[len(joints) :])
         return jax.tree.map(
             lambda first, more, full: jnp.where(gains, first + share * more, full),
             (stopped, stopping),
@@ -82,6 +81,7 @@ def _gains(contacts: tuple[ContactRows, ...], middle: Array, impulses: Impulses)
 
 
 def _share(
+    gains: Array,
     contacts: tuple[ContactRows, ...],
     velocity: Array,
     stopped: Array,
@@ -99,10 +99,22 @@ def _share(
         lost = lost - add_all_slices(first * rate)
         slope = slope + add_all_slices(added * rate + 0.5 * first * faster)
         bend = bend + add_all_slices(added * faster)
+    return share_without_gain(gains, lost, slope, bend)
+
+
+def share_without_gain(gains: Array, lost: Array, slope: Array, bend: Array) -> Array:
+    """The share s (world,) of all rebounds at which the work ``slope s + bend s^2 / 2`` is what the impacts lost.
+
+    Args:
+      gains: whether the full rebound does more; 1 elsewhere.
+      lost: energy [J] that impacts without rebound take; counts as none if it is negative.
+      slope, bend: of the work of the rebound [J].
+    """
     lost = jnp.maximum(lost, 0.0)
-    root = safe_sqrt(jnp.maximum(slope * slope + 2.0 * bend * lost, 0.0))
+    root = safe_sqrt(jnp.where(gains, jnp.maximum(slope * slope + 2.0 * bend * lost, 0.0), 1.0))
+    # Of two forms of the larger root the one in which nothing cancels.
     share = jnp.where(slope > 0, safe_divide(2.0 * lost, slope + root), safe_divide(root - slope, bend))
-    return jnp.clip(share, 0.0, 1.0)
+    return jnp.where(gains, jnp.clip(share, 0.0, 1.0), 1.0)
 
 
 def _rate(contact: ContactRows, middle: Array) -> Array:
