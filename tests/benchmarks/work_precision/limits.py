@@ -10,10 +10,7 @@ LIMITS = {
     "Newton iterations are paid for (1.4 a step at rest: round-off of the load shakes the light cube); it is 1000 times "
     "more exact than asked. Of 2.7 us a world-step about 1 us is LAPACK's elimination of 12 rows, the rest some 500 kernels "
     "of a microsecond and less. Elimination side by side for all worlds was tried: as fast for 12 rows, a third for 24",
-    "pile27 boxes": "in 32 worlds (5.4 ms a step) a third are the 190 turns of ten sweeps over 19 close pairs, one after "
-    "the other; much of the rest are the rows of 540 points at which 27 boxes could touch five planes: pairs with planes "
-    "have slots of their own and never pass the broadphase",
-    "hulls8": "polyhedra never pass the broadphase, since their faces are static: all 28 pairs are searched, clipped and "
-    "solved, though five touch. In 64 worlds search and clipping are some 40 % of a step, exact separating axes of the "
-    "pairs that touch (30 times 30 pairs of edges each) 20 %, sweeps 15 %, in 3500 kernels of a microsecond or two",
+    "hulls8": "eight or nine pairs of 28 are close, three overlap. In 128 worlds search and clipping of two chunks of seven "
+    "places are some 55 % of a step, sweeps over them one after the other 15 %, in some 6800 kernels of a microsecond or "
+    "two. Chunks of 14 places gain nothing. Of 900 pairs of edges one is left to test for the axis of least overlap",
 }
