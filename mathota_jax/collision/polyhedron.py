@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.spatial.indexing import gather_inner, unstack
+from mathota_jax.spatial.indexing import gather_together, unstack
 from mathota_jax.spatial.vector import Vec3, cross, normalize
 
 TOPOLOGY = ("faces", "row", "table")
@@ -100,14 +100,14 @@ def edge_table(faces: np.ndarray) -> np.ndarray:
 def polyhedra_of_places(polyhedra: dict[str, Any], row: Array) -> dict[str, Any]:
     """Parameters of the polyhedra in the given rows (place, world) of those with vertices (vertex, row, world)."""
     table: Vec3 = polyhedra["vertices"]
-    return {"vertices": gather_inner(table, row), "faces": polyhedra["faces"], "table": table, "row": row}
+    return {"vertices": gather_together(table, row), "faces": polyhedra["faces"], "table": table, "row": row}
 
 
 def face_normals(polyhedron: dict[str, Any]) -> Vec3:
     """Outward unit normals of the polyhedra of all pairs, components (face, pair, world)."""
     if "row" not in polyhedron:
         return polyhedron_faces(polyhedron["vertices"], polyhedron["faces"]).normal
-    return gather_inner(polyhedron_faces(polyhedron["table"], polyhedron["faces"]).normal, polyhedron["row"])
+    return gather_together(polyhedron_faces(polyhedron["table"], polyhedron["faces"]).normal, polyhedron["row"])
 
 
 def polyhedron_surface(polyhedron: dict[str, Any]) -> tuple[PolyhedronFaces, Vec3, Vec3]:
@@ -119,7 +119,7 @@ def polyhedron_surface(polyhedron: dict[str, Any]) -> tuple[PolyhedronFaces, Vec
         take_vertices(vertices, start),
         take_vertices(vertices, end),
     )
-    return gather_inner(found, polyhedron["row"]) if "row" in polyhedron else found
+    return gather_together(found, polyhedron["row"]) if "row" in polyhedron else found
 
 
 def face_corners(polyhedron: dict[str, Any], face: Array) -> Array:

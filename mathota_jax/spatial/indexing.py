@@ -51,35 +51,22 @@ def gather(values: Array, index: Array) -> Array:
 
 
 def gather_together(tree: Any, index: Array) -> Any:
-    """Rows of all arrays (row, world or 1) of a pytree by traced indices (place, world), in one operation.
-
-    The result is stored: a gather computed again in every kernel that reads it costs more than what follows, and one for
-    each array costs the compiler a kernel each.
-    """
-    leaves, structure = jax.tree.flatten(tree)
-    worlds = max(index.shape[-1], *(leaf.shape[-1] for leaf in leaves))
-    rows = jnp.stack([jnp.broadcast_to(leaf, (leaf.shape[0], worlds)) for leaf in leaves])
-    places = jnp.broadcast_to(index, (index.shape[0], worlds))[None]
-    chosen = jnp.take_along_axis(rows, places, axis=1, mode="promise_in_bounds")
-    return jax.tree.unflatten(structure, unstack(store(chosen, chosen), 0))
-
-
-def gather_inner(tree: Any, index: Array) -> Any:
     """Entries of all arrays (..., row, world or 1) of a pytree by traced rows (place, world): (..., place, world).
 
-    In one operation, and stored, as in `gather_together`. What all worlds share is copied row by row, without an address
-    for each number.
+    In one operation, and stored: a gather computed again in every kernel that reads it costs more than what follows, and
+    one for each array costs the compiler a kernel each. What all worlds share is copied row by row, without an address for
+    each number.
     """
     leaves, structure = jax.tree.flatten(tree)
     worlds = max(leaf.shape[-1] for leaf in leaves)
     parts = [leaf.reshape(-1, *leaf.shape[-2:]) for leaf in leaves]
     table = jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:2], worlds)) for part in parts])
-    if worlds == 1:
+    if worlds < index.shape[-1]:
         chosen = jnp.take(table[..., 0], index.reshape(-1), axis=1, mode="clip").reshape(-1, *index.shape)
     else:
         places = jnp.broadcast_to(index, (index.shape[0], worlds))[None]
         chosen = jnp.take_along_axis(table, places, axis=1, mode="promise_in_bounds")
-    chosen = jnp.split(store(chosen, chosen), np.cumsum([len(part) for part in parts])[:-1])
+    chosen = jax.lax.split(store(chosen, chosen), [len(part) for part in parts])
     pairs = zip(chosen, leaves, strict=True)
     return jax.tree.unflatten(structure, [c.reshape(*leaf.shape[:-2], *c.shape[1:]) for c, leaf in pairs])
 

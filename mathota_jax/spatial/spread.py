@@ -50,12 +50,8 @@ def add_all_slices(array: Array) -> Array:
 
 def largest_slice(array: Array) -> Array:
     """Maximum (world,) along all axes but the last."""
-    return largest_row(array.reshape(-1, array.shape[-1]))
-
-
-def largest_row(array: Array) -> Array:
-    """Maximum along the first axis, which is removed. Store what is computed: XLA may compute it again for each row."""
-    return functools.reduce(jnp.maximum, unstack(array, 0)) if len(array) <= FEW_SLICES else array.max(0)
+    slices = array.reshape(-1, array.shape[-1])
+    return functools.reduce(jnp.maximum, unstack(slices, 0)) if len(slices) <= FEW_SLICES else slices.max(0)
 
 
 def _broadcast(array: Array, *, shape: tuple[int, ...]) -> Array:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax.spatial.indexing import gather_inner, gather_together
+from mathota_jax.spatial.indexing import gather_together
 
 ROWS, PLACES, WORLDS = 4, 6, 3
 
@@ -22,7 +22,7 @@ def test_entries_by_row(worlds):
         full = np.broadcast_to(values, (*values.shape[:-1], WORLDS))
         return np.stack([full[..., index[:, w], w] for w in range(WORLDS)], axis=-1)
 
-    found, back = jax.vjp(lambda tree: gather_inner(tree, jnp.asarray(index)), tree)
+    found, back = jax.vjp(lambda tree: gather_together(tree, jnp.asarray(index)), tree)
     for name, values in tree.items():
         np.testing.assert_array_equal(found[name], expected(np.asarray(values)))
     (counts,) = back(jax.tree.map(jnp.ones_like, found))

@@ -137,10 +137,13 @@ def _with_edges(placed: _Placed, edges: Sequence, rows: Sequence, chosen: Array,
     """Both polytopes of the chosen lanes with their edges (4, edge, lane or 1)."""
 
     def of_lanes(edges: np.ndarray | None, row: Array | None) -> Array | None:
-        if edges is None or edges.shape[-1] == 1:
-            return edges if edges is None else jnp.asarray(edges)
+        if edges is None:
+            return None
+        table = jnp.asarray(edges)
+        if table.shape[-1] == 1:
+            return table
         row = chosen // shape[1] if row is None else jnp.broadcast_to(row, shape).reshape(-1)[chosen]
-        return jnp.take(jnp.asarray(edges), row, axis=-1, mode="clip")
+        return jnp.take(table, row, axis=-1, mode="clip")
 
     edges_a, edges_b = (of_lanes(*both) for both in zip(edges, rows, strict=True))
     return placed._replace(a=placed.a._replace(edges=edges_a), b=placed.b._replace(edges=edges_b))
@@ -299,18 +302,14 @@ def _best_crossing(placed: _Placed, left_a: Set, left_b: Set) -> Axis:
         found = pick(numbers_a, chosen // EDGES), pick(numbers_b, chosen % EDGES)
         # All edges of B meet some of A, then all of B the next of A.
         done = _is_empty(rest_b)
-        next_a, next_b = (
-            _lowest(rest_a),
-            _lowest([jnp.where(done, whole, rest) for whole, rest in zip(left_b, rest_b, strict=True)]),
-        )
-        (numbers_a, rest_a), (numbers_b, rest_b) = (
-            jax.tree.map(lambda new, old: jnp.where(done, new, old), next_a, (numbers_a, rest_a)),
-            next_b,
-        )
+        busy = state.busy & ~(done & _is_empty(rest_a))
+        advanced = _lowest(rest_a)
+        numbers_a, rest_a = jax.tree.map(lambda new, old: jnp.where(done, new, old), advanced, (numbers_a, rest_a))
+        numbers_b, rest_b = _lowest([jnp.where(done, whole, rest) for whole, rest in zip(left_b, rest_b, strict=True)])
         return _Search(
             (rest_a, rest_b),
             (numbers_a, numbers_b),
-            state.busy & ~(done & _is_empty(state.rest[0])),
+            busy,
             jnp.where(better, score, state.best),
             tuple(jnp.where(better, new, old) for new, old in zip(found, state.pair, strict=True)),  # type: ignore[arg-type]
         )
