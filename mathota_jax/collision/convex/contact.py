@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import CODES, Difference, difference
-from mathota_jax.collision.convex.polish import Closest, Ties, polish
+from mathota_jax.collision.convex.polish import Closest, Ties, polish, solve
 from mathota_jax.collision.convex.polytope import are_polytopes, polytope
 from mathota_jax.collision.convex.search import search_curved, search_polytopes
 from mathota_jax.collision.convex.support import SUPPORT
@@ -66,9 +66,10 @@ def convex_distance(
     if are_polytopes((kind_a, kind_b)):
         core_a, core_b = polytope(kind_a, frozen.a | _topology(a)), polytope(kind_b, frozen.b | _topology(b))
         searched, upper = search_polytopes(frozen, core_a, core_b, tolerance)
+        solution = solve(frozen, searched, jnp.ones(upper.shape, bool))
     else:
-        searched, upper = search_curved(frozen, tolerance)
-    closest = polish(shapes, searched)
+        searched, solution, upper = search_curved(frozen, tolerance)
+    closest = polish(shapes, searched, solution)
     gap = dot(closest.normal, closest.point_b - closest.point_a)
     point_a, point_b = closest.point_a * shapes.scale, closest.point_b * shapes.scale
     separation = gap * shapes.scale

@@ -58,24 +58,32 @@ class Closest(NamedTuple):
     inside: Array
 
 
+class Solution(NamedTuple):
+    """Unit normal from A to B of the largest separation seen [size], and the pieces tied there.
+
+    `exact`: no other piece undercuts them.
+    """
+
+    normal: Vec3
+    separation: Array
+    ties: Ties
+    exact: Array
+
+
 class _Search(NamedTuple):
     turn: Array
     normal: Vec3
     ties: Ties
-    best: Array
-    best_normal: Vec3
-    best_ties: Ties
-    exact: Array
+    best: Solution
     done: Array
 
 
-def polish(shapes: Difference, simplex: Simplex) -> Closest:
-    """Exact closest points from the pieces of the closest simplex. Differentiable in the shapes."""
-    frozen, simplex = lax.stop_gradient((shapes, simplex))
-    rounding = ROUNDING * float(jnp.finfo(shapes.position.x.dtype).eps)
-    found = _find(frozen, simplex, rounding)
-    ties, start = found.best_ties, found.best_normal
-    normal = _implicit_normal(shapes, start, ties, found.exact)
+def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
+    """Exact closest points from what `solve` found for the closest simplex. Differentiable in the shapes."""
+    simplex, solution = lax.stop_gradient((simplex, solution))
+    rounding = _rounding(shapes)
+    ties = solution.ties
+    normal = _implicit_normal(shapes, solution.normal, ties, solution.exact)
     points = _tied_points(shapes, ties, normal)
     weights = barycentric(_differences(points), ties.two, ties.three)
     lowest = lax.stop_gradient(jnp.minimum(weights[0], jnp.minimum(weights[1], weights[2])))
@@ -84,10 +92,10 @@ def polish(shapes: Difference, simplex: Simplex) -> Closest:
         combine(weights, [a for a, _ in points]),
         combine(weights, [b for _, b in points]),
         ties,
-        found.exact,
+        solution.exact,
         lowest >= -rounding,
     )
-    best = found.best
+    best = solution.separation
     for of_b, kind in enumerate((shapes.kind_a, shapes.kind_b)):
         if SUPPORT[kind].rim_radius is not None:
             result, best = _flat_end(shapes, simplex, result, best, bool(of_b), rounding)
@@ -115,57 +123,54 @@ def _implicit_normal_jvp(primals: tuple, tangents: tuple) -> tuple[Vec3, Vec3]:
     return _implicit_normal(shapes, start, ties, exact), where(exact, change, none)
 
 
-def _find(shapes: Difference, simplex: Simplex, rounding: float) -> _Search:
+def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
     """Tied pieces and normal of the solution, by Newton's method with an active set.
 
     The true separation along any direction is a lower bound of the separation: the best direction seen is kept, and a
     piece that undercuts the tied ones joins them.
+
+    Args:
+        shapes: The shapes, not differentiated.
+        simplex: The closest simplex that the search found.
+        wanted: bool, False where the result is not needed: those lanes stop at once.
     """
+    rounding = _rounding(shapes)
 
     def advance(state: _Search) -> _Search:
-        points = _stacked_differences(shapes, state.ties, state.normal)
-        normal = compute_once(_step(shapes, state.ties, state.normal, points), state.best)
+        points = stacked_differences(shapes, state.ties, state.normal)
+        normal = compute_once(_step(shapes, state.ties, state.normal, points), state.best.separation)
         if curved:
-            points = _stacked_differences(shapes, state.ties, normal)
+            points = stacked_differences(shapes, state.ties, normal)
         model = dot(normal, points[0])
         extreme, pieces = shapes.least(normal)
         reach = dot(normal, extreme)
         turned = normal - state.normal
         consistent = model - reach <= 4.0 * rounding
-        code = (reach > state.best).astype(reach.dtype) + 2.0 * (reach > state.best - rounding) + 4.0 * consistent
-        code = settle_code(jnp.where(state.done, 0.0, code))
+        best = state.best
+        code = (reach > best.separation).astype(reach.dtype) + 2.0 * (reach > best.separation - rounding)
+        code = settle_code(jnp.where(state.done, 0.0, code + 4.0 * consistent))
         # Near the solution the separation is flat: the latest consistent normal is the best, to more than half the digits.
-        better = (code >= 6) | ((code & 1 == 1) & ~state.exact)
+        better = (code >= 6) | ((code & 1 == 1) & ~best.exact)
         exact = (code & 4) == 4
-        here = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (reach, normal, state.ties, exact),
-            (state.best, state.best_normal, state.best_ties, state.exact),
-        )
+        here = Solution(normal, reach, state.ties, exact)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), here, best)
         still = dot(turned, turned) <= rounding * rounding
         weights = barycentric(points, state.ties.two, state.ties.three)
         ties = _join(state.ties, pieces, weights, ~exact)
-        best, best_normal, best_ties, exact_best = here
         done = state.done | (exact & still if curved else exact)
-        return _Search(state.turn + 1, normal, ties, best, best_normal, best_ties, exact_best, done)
+        return _Search(state.turn + 1, normal, ties, best, done)
 
     curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
     extreme, pieces = shapes.least(simplex.direction)
     reach = dot(simplex.direction, extreme)
-    none = jnp.zeros(reach.shape, bool)
-    state = _Search(
-        jnp.zeros((), jnp.int32),
-        simplex.direction,
-        distinct(simplex.pieces),
-        reach,
-        simplex.direction,
-        _single(pieces),
-        none,
-        none,
-    )
-    return lax.while_loop(
-        lambda s: (s.turn < (CURVED_STEPS if curved else POLYTOPE_STEPS)) & ~jnp.all(s.done), advance, state
-    )
+    first = Solution(simplex.direction, reach, _single(pieces), jnp.zeros(reach.shape, bool))
+    state = _Search(jnp.zeros((), jnp.int32), simplex.direction, distinct(simplex.pieces), first, ~wanted)
+    steps = CURVED_STEPS if curved else POLYTOPE_STEPS
+    return lax.while_loop(lambda s: (s.turn < steps) & ~jnp.all(s.done), advance, state).best
+
+
+def _rounding(shapes: Difference) -> float:
+    return ROUNDING * float(jnp.finfo(shapes.position.x.dtype).eps)
 
 
 def _join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
@@ -200,17 +205,25 @@ def _rim_tangent(direction: Vec3) -> tuple[Vec3, Array]:
     return Vec3(-direction.z * inverse, zero, direction.x * inverse), inverse
 
 
-def _curvatures(shapes: Difference, ties: Ties, weights: Weights, normal: Vec3) -> list[tuple[Vec3, Array]]:
-    """Minus the Hessian of the tied separations, as a sum of ``curvature * tangent tangent^T``."""
+def rim_radii(shapes: Difference, ties: Ties, weights: Weights) -> list[tuple[bool, Array]]:
+    """Average radius of the rims of the tied pieces, of each shape that has rims: is it B, radius [size]."""
     result = []
     for of_b, kind, shape in ((False, shapes.kind_a, shapes.a), (True, shapes.kind_b, shapes.b)):
         rim_radius = SUPPORT[kind].rim_radius
-        if rim_radius is None:
-            continue
-        local = shapes.rotation.apply_transposed(normal) if of_b else normal
-        tangent, inverse = _rim_tangent(local)
-        codes = [pieces % CODES if of_b else pieces // CODES for pieces in ties.pieces]
-        radius = sum((w * rim_radius(shape, c) for w, c in zip(weights, codes, strict=True)), jnp.zeros_like(inverse))
+        if rim_radius is not None:
+            codes = [pieces % CODES if of_b else pieces // CODES for pieces in ties.pieces]
+            mean = sum(
+                (w * rim_radius(shape, c) for w, c in zip(weights, codes, strict=True)), jnp.zeros_like(weights[0])
+            )
+            result.append((of_b, mean))
+    return result
+
+
+def _curvatures(shapes: Difference, ties: Ties, weights: Weights, normal: Vec3) -> list[tuple[Vec3, Array]]:
+    """Minus the Hessian of the tied separations, as a sum of ``curvature * tangent tangent^T``."""
+    result = []
+    for of_b, radius in rim_radii(shapes, ties, weights):
+        tangent, inverse = _rim_tangent(shapes.rotation.apply_transposed(normal) if of_b else normal)
         result.append((shapes.rotation.apply(tangent) if of_b else tangent, radius * inverse))
     return result
 
@@ -220,7 +233,7 @@ def _tied_points(shapes: Difference, ties: Ties, normal: Vec3) -> list[tuple[Vec
     return [compute_once(shapes.points(pieces, normal), normal.x) for pieces in ties.pieces]
 
 
-def _stacked_differences(shapes: Difference, ties: Ties, normal: Vec3) -> list[Vec3]:
+def stacked_differences(shapes: Difference, ties: Ties, normal: Vec3) -> list[Vec3]:
     """Difference points of the ties, looked up side by side: compiled three times faster, but not made for derivatives."""
     count = len(ties.pieces)
     along = normal.map(lambda c: jnp.broadcast_to(c, (count, *c.shape)))

@@ -7,15 +7,20 @@ for polytopes (`separating_axis`), by an expanding polytope for curved shapes (`
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.collision.candidates import best_candidate, pick
+from mathota_jax.collision.convex.cap import proved_cap
 from mathota_jax.collision.convex.difference import Difference
 from mathota_jax.collision.convex.epa import epa
 from mathota_jax.collision.convex.gjk import Simplex, gjk
+from mathota_jax.collision.convex.polish import Solution, Ties, solve
 from mathota_jax.collision.convex.polytope import Polytope
 from mathota_jax.collision.convex.separating_axis import separating_axis
 from mathota_jax.spatial.vector import Vec3, dot, where
@@ -23,10 +28,12 @@ from mathota_jax.spatial.vector import Vec3, dot, where
 POLYTOPE_ITERATIONS = 16
 CURVED_ITERATIONS = {"float32": 24, "float64": 40}
 """Most iterations of the distance search."""
-GLANCE, PROOF = 16, 110
-"""Most iterations of the penetration search: of the first, which looks for a seed, and of those that prove it."""
-PROOFS = 2
+PROOF = 120
+"""Most iterations of the penetration search."""
+PROOFS = 6
 """Proofs in a row: each starts from what the one before found in place of its seed."""
+SEEDS = [d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)]
+"""Directions in the frame of A among which the first local minimum is looked for, besides the axes of B."""
 LIFT = 0.01
 """Overlapping shapes are pulled apart to this gap (share of the size)."""
 LIFT_RATIO = {"float32": 0.3, "float64": 0.01}
@@ -96,7 +103,9 @@ def _no_simplex(zero: Vec3, point: Vec3 | None) -> Simplex:
 
 
 class _Search(NamedTuple):
+    turn: Array
     simplex: Simplex
+    solution: Solution
     start: Vec3
     shift: Vec3
     lift: Array
@@ -105,12 +114,12 @@ class _Search(NamedTuple):
     done: Array
 
 
-def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Array]:
-    """Closest simplex of two shapes of which one has a rim, and an upper bound of their separation.
+def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Solution, Array]:
+    """Closest simplex of two shapes of which one has a rim, its solution, and an upper bound of their separation.
 
-    Overlapping shapes are searched again after pulling them apart along the least overlap. Where the penetration search
-    was not done, that yields a direction that is at least a local minimum: the seed of the next one. All searches are
-    turns of one loop, so that they are compiled once.
+    Overlapping shapes are searched again after pulling them apart along the least overlap that a glance found, which
+    yields a local minimum. What no cap around it proves is left to the penetration search; a better direction that this
+    finds is the start of the next turn. All searches are turns of one loop, so that they are compiled once.
 
     Args:
         shapes: The shapes, not differentiated.
@@ -118,28 +127,55 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Array]
     """
     number = shapes.position.x.dtype
 
-    def turn(index: Array, state: _Search) -> _Search:
+    def turn(state: _Search) -> _Search:
         found = gjk(shapes, state.start, state.shift, ~state.done, CURVED_ITERATIONS[str(number)])
-        simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), found, state.simplex)
-        first = index == 0
+        first = state.turn == 0
+        solved = solve(shapes, found, ~state.done & ~(first & found.overlap))
+        simplex, solution = jax.tree.map(
+            lambda new, old: jnp.where(state.done, old, new), (found, solved), (state.simplex, state.solution)
+        )
         overlap = jnp.where(first, found.overlap, state.overlap)
         wanted = jnp.where(first, found.overlap | _stalled(found, _reach(shapes, found), tolerance), ~state.done)
-        limit = jnp.where(first, GLANCE, jnp.where(index <= PROOFS, PROOF, 0))
-        least = epa(shapes, simplex.direction, wanted, limit, PROOF, tolerance)
+        cap = proved_cap(shapes, solution, tolerance)
+        least = epa(shapes, solution.normal, cap.half, wanted & ~first & ~cap.whole, PROOF, tolerance)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
-        upper = jnp.where(overlap & wanted, jnp.minimum(upper, -least.lower), upper)
-        # The first seed is none. Later a lane keeps the simplex of its seed unless the search found a better direction.
-        done = ~wanted | (~first & (least.depth >= least.seed_depth - tolerance))
-        lift = state.lift * LIFT_RATIO[str(number)]
+        lower = jnp.where(cap.whole, -solution.separation, least.lower)
+        upper = jnp.where(overlap & wanted & ~first, jnp.minimum(upper, -lower), upper)
+        # A lane keeps the simplex of its seed unless the search found a better direction.
+        done = ~wanted | (~first & (cap.whole | (least.depth >= least.seed_depth)))
+        start = where(first, seed, least.direction)
+        depth = jnp.where(first, seed_depth, least.depth)
+        lift = state.lift * jnp.where(first, 1.0, LIFT_RATIO[str(number)])
         return _Search(
-            simplex, least.direction, least.direction * (least.depth + state.lift), lift, overlap, upper, done
+            state.turn + 1, simplex, solution, start, start * (depth + state.lift), lift, overlap, upper, done
         )
 
+    seed, seed_depth = _glance(shapes)
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
     no = zero > 0
+    none = _no_simplex(vector, vector)
     state = _Search(
-        _no_simplex(vector, vector), shapes.position, vector, jnp.asarray(LIFT, number), no, zero + jnp.inf, no
+        jnp.zeros((), jnp.int32),
+        none,
+        Solution(vector, zero, Ties(none.pieces, no, no), no),
+        shapes.position,
+        vector,
+        jnp.asarray(LIFT, number),
+        no,
+        zero + jnp.inf,
+        no,
     )
-    state = lax.fori_loop(0, PROOFS + 2, turn, state)
-    return state.simplex, state.upper
+    state = lax.while_loop(lambda s: (s.turn <= PROOFS) & ~jnp.all(s.done), turn, state)
+    return state.simplex, state.solution, state.upper
+
+
+def _glance(shapes: Difference) -> tuple[Vec3, Array]:
+    """The least deep of a few directions, and its depth."""
+    like = shapes.position.x
+    ours = [Vec3(*(jnp.full_like(like, c / math.hypot(*d)) for c in d)) for d in SEEDS]
+    theirs = [axis * sign for axis in shapes.rotation for sign in (1.0, -1.0)]
+    directions = Vec3(*(jnp.stack(components) for components in zip(*ours, *theirs, strict=True)))
+    extreme, _ = shapes.least(directions)
+    separation, index = best_candidate(dot(directions, extreme))
+    return pick(directions, index), -separation
