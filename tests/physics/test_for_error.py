@@ -13,7 +13,7 @@ FACTOR = 2.0
 def reached(name, options):
     """Largest error over the worlds of a scene, relative to its scale."""
     scene = SCENES[name]
-    program = engine.program(scene, options, scene.worlds)
+    program = engine.of_options(scene, options, scene.worlds)
     frames = program.record(scene, options.dt)
     assert frames.finite
     return scene.judge(start_of(name, scene.worlds), frames, options.dt).max() / scene.scale

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,7 +13,7 @@ from mathota_jax import Hinge, Options, SceneBuilder, Sphere
 from tests.benchmarks.hard_cases import TIERS
 from tests.benchmarks.ours import batched_step, repeat
 from tests.benchmarks.work_precision.jax_program import JaxProgram
-from tests.benchmarks.work_precision.scenes import TIGHT, TIGHT_QUICK, Scene, start_of
+from tests.benchmarks.work_precision.scenes import DOUBLE, OURS, TIGHT, TIGHT_QUICK, Scene, start_of
 from tests.benchmarks.work_precision.worlds import Motion, World
 
 SETTINGS = {**TIERS, "pgs, 30 sweeps": {"velocity_iterations": 30}, "pgs, split at impacts": {"impact_events": 2}}
@@ -43,12 +44,25 @@ def build(world: World, options: Options) -> tuple[Any, Any]:
 
 def undamped(scene: Scene, setting: str) -> Options:
     """Options of a setting for a scene, without damping, which no truth contains."""
-    changes = {"pair_capacity": scene.capacity, **ROOM[setting]} if setting in ROOM else SETTINGS[setting]
+    if setting in ROOM:
+        changes = {"pair_capacity": scene.capacity, **ROOM[setting]}
+    else:
+        changes = SETTINGS[OURS[0] if setting == DOUBLE else setting]
     return Options(dt=DT, linear_damping=0.0, angular_damping=0.0, **changes)
 
 
-def program(scene: Scene, options: Options, count: int) -> JaxProgram:
+def program(scene: Scene, setting: str, count: int) -> JaxProgram:
     """The scene in `count` worlds."""
+    return of_options(scene, undamped(scene, setting), count, setting == DOUBLE)
+
+
+def of_options(scene: Scene, options: Options, count: int, double: bool = False) -> JaxProgram:
+    """The scene with other options than those of a setting."""
+    with jax.enable_x64(double):
+        return _program(scene, options, count, double)
+
+
+def _program(scene: Scene, options: Options, count: int, double: bool) -> JaxProgram:
     model, state = build(scene.world, options)
     static = len(state.position) - len(scene.world.moving)
     start = start_of(scene.name, count)
@@ -62,6 +76,7 @@ def program(scene: Scene, options: Options, count: int) -> JaxProgram:
     def motion(states: Any, worlds: int) -> Motion:
         return Motion(*(np.asarray(getattr(states, name)[:worlds, static:], float) for name in leaves))
 
-    return JaxProgram(
-        lambda dt: dataclasses.replace(model, dt=jnp.full_like(model.dt, dt)), states, batched_step, motion, count
-    )
+    def parameters(dt: float) -> Any:
+        return dataclasses.replace(model, dt=jnp.full_like(model.dt, dt))
+
+    return JaxProgram(parameters, states, batched_step, motion, count, double)

@@ -76,7 +76,7 @@ def _reverse(program: JaxProgram, speed_of: Callable, with_speed: Callable, x_of
 
 
 def _ours(dt: float, setting: str) -> tuple:
-    program = engine.program(SCENES["slide"], engine.undamped(SCENES["slide"], setting), WORLDS)
+    program = engine.program(SCENES["slide"], setting, WORLDS)
 
     def with_speed(states: Any, speeds: Any) -> Any:
         return dataclasses.replace(states, velocity=states.velocity.at[:, 1, 0].set(speeds))

@@ -26,6 +26,7 @@ class JaxProgram:
       step: (parameters, states) -> states.
       motion: (states, number of worlds) -> `Motion` of the first worlds.
       count: number of worlds.
+      double: in float64.
       final: states at the end of the last record.
     """
 
@@ -34,6 +35,7 @@ class JaxProgram:
     step: Callable[[Any, Any], Any]
     motion: Callable[[Any, int], Motion]
     count: int
+    double: bool = False
     final: Any = None
 
     @functools.cached_property
@@ -42,7 +44,8 @@ class JaxProgram:
             return jax.lax.fori_loop(0, steps, lambda _, current: self.step(parameters, current), states)
 
         begin = time.process_time()
-        run = jax.jit(advance).lower(self.parameters(1 / 240), self.states, np.int32(1)).compile()
+        with jax.enable_x64(self.double):
+            run = jax.jit(advance).lower(self.parameters(1 / 240), self.states, np.int32(1)).compile()
         return run, time.process_time() - begin
 
     @property
@@ -59,10 +62,12 @@ class JaxProgram:
 
     def record(self, scene: Scene, dt: float) -> Motion:
         """Kept frames of the different worlds."""
-        parameters, states, frames, done = self.parameters(dt), self.states, [], 0
-        for step in kept_steps(scene, dt):
-            states, done = self._compiled[0](parameters, states, np.int32(step - done)), step
-            frames.append(self.motion(states, scene.worlds))
+        states, frames, done = self.states, [], 0
+        with jax.enable_x64(self.double):
+            parameters = self.parameters(dt)
+            for step in kept_steps(scene, dt):
+                states, done = self._compiled[0](parameters, states, np.int32(step - done)), step
+                frames.append(self.motion(states, scene.worlds))
         self.final = states
         return stack(frames)
 
@@ -72,10 +77,13 @@ class JaxProgram:
 
     def block_of(self, steps: int, dt: float) -> Block:
         """Runs a number of steps from the start."""
-        parameters, compiled = self.parameters(dt), self._compiled[0]
+        compiled = self._compiled[0]
+        with jax.enable_x64(self.double):
+            parameters = self.parameters(dt)
 
         def run() -> int:
-            jax.block_until_ready(compiled(parameters, self.states, np.int32(steps)))
+            with jax.enable_x64(self.double):
+                jax.block_until_ready(compiled(parameters, self.states, np.int32(steps)))
             return self.count * steps
 
         return run

@@ -33,7 +33,7 @@ def measure(settings: Settings) -> dict:
 
 def _worlds(counts: tuple[int, ...], settings: Settings) -> list[dict]:
     scene = SCENES["slide"]
-    programs = {count: engine.program(scene, engine.undamped(scene, "pgs"), count) for count in counts}
+    programs = {count: engine.program(scene, "pgs", count) for count in counts}
     contestants = {count: Contestant(program.block_of(STEPS, TIME_STEP), {}) for count, program in programs.items()}
     interleave(contestants, settings)
     rows = []
@@ -56,7 +56,7 @@ def _single(settings: Settings) -> dict[str, Any]:
     """CPU and wall time [us] of a step of one cube on a plane, called from Python and inside a loop."""
     model, state = engine.build(SCENES["slide"].world, engine.undamped(SCENES["slide"], "pgs"))
     call = jax.jit(lambda model, state: step(model, state)).lower(model, state).compile()
-    loop = engine.program(SCENES["slide"], engine.undamped(SCENES["slide"], "pgs"), 1).block_of(CALLS, TIME_STEP)
+    loop = engine.program(SCENES["slide"], "pgs", 1).block_of(CALLS, TIME_STEP)
 
     def calls() -> int:
         current = state

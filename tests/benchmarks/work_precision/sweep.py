@@ -114,7 +114,7 @@ def _ours(scene: Scene, settings: Settings) -> tuple[list[Point], list[dict]]:
     """All settings, at the number of worlds at which the first one is fastest."""
     programs, batches = {}, []
     for count in scene.batches[:1] if settings.mode == "quick" else scene.batches:
-        program = engine.program(scene, engine.undamped(scene, scene.settings[0]), max(count, scene.worlds))
+        program = engine.program(scene, scene.settings[0], max(count, scene.worlds))
         probe = Contestant(program.block_of(PROBE_STEPS, engine.DT), {})
         interleave({"": probe}, dataclasses.replace(settings, rounds=5))
         rate = probe.report()["cpu_rate"]["median"]
@@ -124,7 +124,7 @@ def _ours(scene: Scene, settings: Settings) -> tuple[list[Point], list[dict]]:
     points = []
     for setting in scene.settings:
         first = setting == scene.settings[0]
-        program = best if first else engine.program(scene, engine.undamped(scene, setting), best.count)
+        program = best if first else engine.program(scene, setting, best.count)
         points += [_jax_point(OURS, setting, scene, program, dt) for dt in _time_steps(scene, settings)]
     return points, batches
 
