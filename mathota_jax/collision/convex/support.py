@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.indexing import gather_together, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle_code, store
 from mathota_jax.spatial.vector import Vec3, norm
@@ -179,8 +179,9 @@ def _gathered(component: Array, code: Array) -> Array:
 
 
 def _polyhedron_extent(shape: Parameters) -> Array:
-    vertices = shape["vertices"]
-    return jnp.sqrt(jnp.max(vertices.x**2 + vertices.y**2 + vertices.z**2, axis=0))
+    vertices = shape.get("table", shape["vertices"])
+    extent = jnp.sqrt(jnp.max(vertices.x**2 + vertices.y**2 + vertices.z**2, axis=0))
+    return gather_together(extent, shape["row"]) if "row" in shape else extent
 
 
 def _radius(shape: Parameters) -> Array:
