@@ -30,6 +30,7 @@ from tests.benchmarks.process import ONE_CORE
 from tests.benchmarks.settings import QUICK
 from tests.benchmarks.timing import Contestant, interleave, paired_ratio, summary
 from tests.convex_oracle import Placed, oracle, to_engine
+from tests.direction_oracle import direction_distance
 from tests.hulls import hull
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -48,11 +49,13 @@ POINTS = {count: _unit_points(count) for count in (16, 64)}
 
 
 class Case(NamedTuple):
-    """Kinds, distance of the centres [m] of shapes about 1 m in radius, and corners of the hulls."""
+    """Kinds, distance of the centres [m] of shapes about 1 m in radius, corners of the hulls, and the separations [m]."""
 
     pair: tuple[str, str]
     distance: float
     corners: int = 16
+    separations: tuple[float, float] | None = None
+    """Least and largest, uniform between them, by moving B along the normal; None leaves it where it is."""
 
 
 CASES = {
@@ -65,6 +68,7 @@ CASES = {
     "hull16_deep": Case(("polyhedron", "polyhedron"), 0.5),
     "hull64_deep": Case(("polyhedron", "polyhedron"), 0.5, 64),
     "cylinder_cylinder_apart": Case(("cylinder", "cylinder"), 2.2),
+    "cylinder_cylinder_touching": Case(("cylinder", "cylinder"), 1.0, separations=(-1e-3, 1e-4)),
     "cylinder_cylinder_deep": Case(("cylinder", "cylinder"), 0.5),
 }
 VALUE, MANIFOLD, GRADIENT = "signed distance", "manifold", "value and gradient"
@@ -153,6 +157,9 @@ def poses(case: Case, count: int) -> dict[str, Any]:
     for side, kind in zip("ab", case.pair, strict=True):
         scene[side] = {n: np.repeat(np.asarray(v, float)[None], count, axis=0) for n, v in shapes[kind].items()}
         scene["q" + side] = Rotation.random(count, random_state=rng).as_quat()[:, [3, 0, 1, 2]]  # pyright: ignore[reportCallIssue]
+    if case.separations is not None:
+        truths, normals = direction_distance(case.pair, scene)
+        scene["pb"] = scene["pb"] + (rng.uniform(*case.separations, size=count) - truths)[:, None] * normals
     return scene
 
 

@@ -16,6 +16,7 @@ from mathota_jax.collision.convex.support import SUPPORT, Parameters
 from mathota_jax.collision.polyhedron import TOPOLOGY
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm
 from mathota_jax.struct import pytree, static
 
@@ -46,9 +47,14 @@ class Difference:
         return CODES * code_a + code_b
 
     def points(self, pieces: Array, direction: Vec3) -> tuple[Vec3, Vec3]:
-        """Points of A and of B, in the frame of A, of a piece pair at the direction (A's along it, B's against it)."""
+        """Points of A and of B, in the frame of A, of a piece pair at a stored direction (A's along it, B's against it)."""
         point_a = SUPPORT[self.kind_a].point(self.a, pieces // CODES, direction)
-        local = SUPPORT[self.kind_b].point(self.b, pieces % CODES, -self.rotation.apply_transposed(direction))
+        against = -self.rotation.apply_transposed(direction)
+        if SUPPORT[self.kind_b].rim_radius is not None:
+            # Along the axis of a rim what is left across it is round-off, but one and the same for all components: else
+            # they belong to different points of the rim, and together to none.
+            against = compute_once(against, direction.x)
+        local = SUPPORT[self.kind_b].point(self.b, pieces % CODES, against)
         return point_a, self.position + self.rotation.apply(local)
 
     def point(self, pieces: Array, direction: Vec3) -> Vec3:

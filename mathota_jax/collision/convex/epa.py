@@ -101,7 +101,7 @@ class _State(NamedTuple):
 def epa(
     shapes: Difference, seed: Vec3, half_proved: Array, wanted: Array, capacity: int, tolerance: float
 ) -> Penetration:
-    """Least overlap of two shapes that overlap. A lane stops as soon as it has seen a smaller one than at its seed.
+    """Least overlap of two shapes that overlap.
 
     Args:
         shapes: The shapes, not differentiated.
@@ -118,7 +118,7 @@ def epa(
     assert len(CORNERS) + capacity <= BASE
 
     def sample_corner(corner: Array) -> tuple[Vec3, Vec3, Array]:
-        direction = frame[0] * corner[0] + frame[1] * corner[1] + frame[2] * corner[2]
+        direction = compute_once(frame[0] * corner[0] + frame[1] * corner[1] + frame[2] * corner[2], seed.x)
         return direction, *_sample(shapes, direction)
 
     axes, points, heights = lax.map(sample_corner, jnp.asarray(CORNERS, number))
@@ -147,7 +147,7 @@ def epa(
         stack=empty.push(names, list(bounds), best - tolerance),
         best=best,
         direction=direction,
-        done=~wanted | (best < seed_depth),
+        done=~wanted,
     )
 
     def advance(state: _State) -> _State:
@@ -159,7 +159,7 @@ def epa(
         corners = tuple(state.corners.map(lambda c, i=i: _row(c, i)) for i in indices)
         points = tuple(state.points.map(lambda c, i=i: _row(c, i)) for i in indices)
         _, choice = _least(corners, points)
-        direction = _split(corners, points, choice)
+        direction = compute_once(_split(corners, points, choice), best)
         point, height = _sample(shapes, direction)
 
         new = state.turn + len(CORNERS)
@@ -172,15 +172,16 @@ def epa(
         names = [indices[i] + BASE * indices[j] + BASE * BASE * new for i, j in ((1, 2), (2, 0), (0, 1))]
         names = [name.astype(number) for name in names]
         improves = ~done & (height < best - tolerance)
+        best = jnp.where(improves, height, best)
         popped = stack._replace(size=jnp.where(done, stack.size, top))
         return _State(
             turn=state.turn + 1,
             corners=_put(state.corners, direction, new),
             points=_put(state.points, point, new),
             stack=popped.push(compute_once(names, best), list(child_bounds), best - tolerance),
-            best=jnp.where(improves, height, best),
+            best=best,
             direction=where(improves, direction, state.direction),
-            done=done | improves,
+            done=done,
         )
 
     state = lax.while_loop(lambda s: (s.turn < capacity) & ~jnp.all(s.done | (s.stack.size == 0)), advance, state)
@@ -206,8 +207,8 @@ def _put(table: Vec3, value: Vec3, index: Array) -> Vec3:
 
 def _sample(shapes: Difference, direction: Vec3) -> tuple[Vec3, Array]:
     """Support point of A - B along a unit direction from A to B, and its height."""
-    point, _ = shapes.least(direction)
-    return -point, -dot(point, direction)
+    point = compute_once(-shapes.least(direction)[0], direction.x)
+    return point, dot(point, direction)
 
 
 def _crossing(corners: tuple, points: tuple, i: int, j: int) -> tuple[Vec3, Array, Array]:

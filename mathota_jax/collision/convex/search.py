@@ -30,7 +30,7 @@ CURVED_ITERATIONS = {"float32": 24, "float64": 40}
 """Most iterations of the distance search."""
 PROOF = 120
 """Most iterations of the penetration search."""
-PROOFS = 6
+PROOFS = 3
 """Proofs in a row: each starts from what the one before found in place of its seed."""
 SEEDS = [d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)]
 """Directions in the frame of A among which the first local minimum is looked for, besides the axes of B."""
