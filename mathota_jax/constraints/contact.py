@@ -162,7 +162,7 @@ def contact_rows(
         target, lever = rebound(approach, model.dt, model.dt * (1.0 + 1.0 / scene.options.substep_count))
     else:
         target, lever = impact(approach, model.dt)
-    active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
+    active = compute_once(pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0], normal.x)
     # Empty columns of a table have no response.
     entries = entries_of(matrix.dense())
     mass = safe_divide(active, normal_bound(entries, table.together, active))
