@@ -34,7 +34,7 @@ from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Cone, Push
-from mathota_jax.solver.row_matrix import Points
+from mathota_jax.solver.row_matrix import FirstRow, Points
 from mathota_jax.solver.rows import Places, Rows, matrix_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
@@ -339,7 +339,7 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
     )
     mass = normal_mass(rows)
     return Rows(
-        matrix=rows.matrix.first_row(),
+        matrix=FirstRow(rows.matrix),
         bias=jnp.where(error < 0, percent * error, error),
         law=_push_only(mass),
         table=rows.table,

@@ -54,7 +54,7 @@ class Dense:
 
     def first_row(self) -> Dense:
         """That of the first row of each constraint alone."""
-        return Dense(tuple(side[:, :1] for side in self.jacobian), tuple(side[:, :1] for side in self.response))
+        return Dense(*(tuple(_first(side) for side in sides) for sides in (self.jacobian, self.response)))
 
     def dense(self) -> Dense:
         return self
@@ -129,7 +129,7 @@ class Points:
 
     def first_row(self) -> Points:
         """As `Dense.first_row`."""
-        return Points(self.directions[:, :1], tuple(side[:, :1] for side in self.angular), self.packed_inertia)
+        return Points(_first(self.directions), tuple(_first(side) for side in self.angular), self.packed_inertia)
 
     def dense(self) -> Dense:
         """The same rows with all entries. Stored: each product, and each cotangent, would compute them again."""
@@ -154,7 +154,42 @@ class Points:
         return jnp.repeat(values, together, axis=-2)[..., None, None, :, :]
 
 
-RowMatrix = Dense | Points
+@pytree
+class FirstRow:
+    """The first row of each constraint of other rows, taken out where it is used: a copy for all turns takes longer."""
+
+    whole: Dense | Points
+
+    @property
+    def like(self) -> Array:
+        """A finite array (..., row, column, world)."""
+        return self.whole.first_row().like
+
+    def rates(self, velocities: Sequence[Array]) -> Array:
+        """As `Dense.rates`."""
+        return self.whole.first_row().rates(velocities)
+
+    def changes(self, impulse: Array, together: int) -> list[Array]:
+        """As `Dense.changes`."""
+        return self.whole.first_row().changes(impulse, together)
+
+    def linear_responses(self) -> tuple[Array, ...]:
+        """As `Dense.linear_responses`."""
+        return self.whole.first_row().linear_responses()
+
+    def first_row(self) -> FirstRow:
+        return self
+
+    def dense(self) -> Dense:
+        """The same rows with all entries."""
+        return self.whole.first_row().dense()
+
+
+RowMatrix = Dense | Points | FirstRow
+
+
+def _first(rows: Array) -> Array:
+    return rows[..., :1, :, :, :]
 
 
 def _along(rows: Array, velocity: Array) -> Array:
