@@ -228,7 +228,7 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
             column = jnp.arange(tier.pair_count, dtype=jnp.int32)[None, :, None]
             held.append((column < counts[rows][:, None]).reshape(-1, worlds))
             position = jnp.minimum(starts[rows][:, None] + column, capacity - 1).reshape(-1, worlds)
-            listed.append(gather(sorted_pairs, position))
+            listed.append(position if sorted_pairs is None else gather(sorted_pairs, position))
             lost |= (counts[rows] > tier.pair_count).any(0)
             tables.append(TracedTable(tier.turn_count, tier.pair_count, group.point_count, slot, block_count))
             sizes.append(jnp.clip(used - first_turn, 0, tier.turn_count))
@@ -239,19 +239,23 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     return groups, lost
 
 
-def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array, Array, Array]:
+def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array | None, Array, Array]:
     """Listed pairs sorted by turn, those of all groups; how many each turn holds, and where in the order they begin.
 
-    Each group has one turn more than it has places for: what is there is lost.
+    The order is None where it is that of the list. Each group has one turn more than it has places for: what is there is
+    lost.
     """
     turn_count, capacity, active = max(turn_counts), found.first.shape[0], found.active
     assert scene.broadphase is not None
-    if scene.broadphase.one_by_one and len(scene.compact_groups) == 1:
-        # The list has no gaps: each pair has the turn of its own number.
-        order, turns = jnp.arange(capacity, dtype=jnp.int32), jnp.arange(turn_count + 1, dtype=jnp.int32)[:, None]
-        counts = (turns < found.count).astype(jnp.int32)
-        return jnp.broadcast_to(order[:, None], active.shape), counts, jnp.broadcast_to(turns, counts.shape)
-    group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
+    several = len(scene.compact_groups) > 1
+    group_of_pair = jnp.asarray(_group_codes(scene))[found.first, found.second] if several else 0
+    if _in_list_order(scene):
+        # The list has no gaps: each pair has the turn of its number in its group.
+        turns = jnp.arange(turn_count + 1, dtype=jnp.int32)[:, None]
+        sizes = [(active & (group_of_pair == group)).sum(0, dtype=jnp.int32) for group in range(len(turn_counts))]
+        counts = [(turns < size).astype(jnp.int32) for size in sizes]
+        starts = [turns + sum(sizes[:group], jnp.zeros_like(found.count)) for group in range(len(sizes))]
+        return None, jnp.concatenate(counts), jnp.concatenate(starts)
     if scene.broadphase.one_by_one:
         colour = _ranks(group_of_pair, active, len(turn_counts))
     else:
@@ -270,6 +274,13 @@ def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array
     counts = jnp.zeros((len(turn_counts) * (turn_count + 1), worlds), jnp.int32)
     counts = counts.at[code, jnp.arange(worlds)].add(1, mode="drop")
     return sorted_pairs, counts, jnp.cumsum(counts, axis=0) - counts
+
+
+def _in_list_order(scene: Scene) -> bool:
+    """Whether each pair has a turn of its own, and those of a group follow one another in the list."""
+    assert scene.broadphase is not None
+    codes = _group_codes(scene)[admissible_pairs(scene).pairs]
+    return scene.broadphase.one_by_one and bool((np.diff(codes) >= 0).all())
 
 
 def _blocks(scene: Scene) -> Array:
@@ -336,7 +347,7 @@ def _moving_shapes(scene: Scene) -> np.ndarray:
     return ~np.asarray(admissible_pairs(scene).static)
 
 
-def _group_codes(scene: Scene) -> Array:
+def _group_codes(scene: Scene) -> np.ndarray:
     """(shape, shape) group of each pair of shapes; 0 for pairs that are never listed."""
     assert scene.broadphase is not None
     kinds = [scene.shapes[entry].kind for entry in scene.broadphase.shapes]
@@ -345,7 +356,7 @@ def _group_codes(scene: Scene) -> Array:
     codes = np.zeros((len(names), len(names), 3), np.int32)
     for number, group in enumerate(scene.compact_groups):
         codes[names.index(group.kind_a), names.index(group.kind_b), group.side_count] = number
-    return jnp.asarray(codes[kind[:, None], kind[None, :], moving[:, None] + moving[None, :]])
+    return codes[kind[:, None], kind[None, :], moving[:, None] + moving[None, :]]
 
 
 def _example(scene: Scene, group: CompactGroup) -> tuple[int, int]:

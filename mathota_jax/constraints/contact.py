@@ -35,7 +35,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.row_matrix import FirstRow, Points
-from mathota_jax.solver.rows import Places, Rows, matrix_velocity
+from mathota_jax.solver.rows import Places, Rows, map_turns, matrix_velocity, row_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
@@ -328,23 +328,21 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
 
     Args:
       contact: rows of one table.
-      displacement: (turn, 1, column, world) change of the separation in this step.
+      displacement: (component, block, world) of the moving bodies in this step.
       percent: share of the overlap beyond the slop that is corrected.
     """
-    rows = contact.rows
-    # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never that
-    # the overlap went beyond the body's middle.
-    error = (
-        jnp.maximum(contact.separation + displacement, jnp.minimum(contact.separation, -contact.size)) + contact.slop
-    )
-    mass = normal_mass(rows)
-    return Rows(
-        matrix=FirstRow(rows.matrix),
-        bias=jnp.where(error < 0, percent * error, error),
-        law=_push_only(mass),
-        table=rows.table,
-        places=rows.places,
-    )
+    rows, first = contact.rows, FirstRow(contact.rows.matrix)
+
+    def bias(part: Rows, levels: tuple[Array, Array, Array]) -> Array:
+        separation, slop, size = levels
+        # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never
+        # that the overlap went beyond the body's middle.
+        error = jnp.maximum(separation + row_velocity(part, displacement), jnp.minimum(separation, -size)) + slop
+        return jnp.where(error < 0, percent * error, error)
+
+    firsts = dataclasses.replace(rows, matrix=first, law=_push_only(normal_mass(rows)))
+    levels = (contact.separation, contact.slop, contact.size)
+    return dataclasses.replace(firsts, bias=map_turns(bias, firsts, levels))
 
 
 def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:

@@ -105,12 +105,6 @@ def constrain(
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
         contacts, close = find_slots(model, bodies, free)
-        contacts = contacts._replace(
-            **compute_once(
-                {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation},
-                state.position,
-            )
-        )
         if scene.options.continuous:
             contacts = contact.near_contacts(scene, model, contacts)
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)

@@ -10,6 +10,7 @@ from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_co
 from mathota_jax.constraints import compact, warm_start
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
 
@@ -26,7 +27,9 @@ def find_slots(
     """
     scene, found, close = model.scene, [], None
     if scene.pair_groups:
-        found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
+        own = find_contacts(scene, model.shapes, bodies.position, bodies.orientation)
+        stored = {"position": own.position, "normal": own.normal, "separation": own.separation}
+        found.append(own._replace(**compute_once(stored, bodies.position.x)))
     if scene.broadphase is not None:
         close = compact.close_pairs(model, bodies, free)
         found += compact.contacts_of(model, bodies, close)
