@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -103,9 +104,7 @@ def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[Contact
 
         pairs = (places.pair, places.active)
         if scene.broadphase.one_by_one:
-            (_, placed), *_ = places.tables
-            assert placed.places.turns is not None
-            found.append(map_filled(contacts, pairs, placed.places.turns))
+            found.append(map_filled(contacts, pairs, _filled(places)))
         else:
             found.append(contacts(pairs))
     return found
@@ -138,19 +137,35 @@ def matched_force(
       scene, close, contacts: static structure, and what is close in this step; all slots.
       force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
     """
+    assert scene.broadphase is not None
+    one_by_one = scene.broadphase.one_by_one
+    sources = [] if one_by_one else _sources(scene, close, pair)
     parts, slot = [], scene.static_slot_count
-    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
+    for number, (group, p) in enumerate(zip(scene.compact_groups, close.groups, strict=True)):
         rows = range(slot, slot + group.slot_count)
-        old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
+        shape = (group.place_count, group.point_count, -1)
+        found = [x.reshape(shape) for x in take((contacts.feature, contacts.active), rows)]
+        old = jax.tree.map(lambda x, shape=shape: x.reshape(shape), take((feature, force), rows))
 
-        def by_point(values: Array, count: int = group.point_count) -> Array:
-            return values.reshape(-1, count, values.shape[-1])
+        def matched(places: tuple, number: int = number, old: tuple[Array, Vec3] = old) -> Vec3:
+            where, new_feature, active = places
+            source, known = _known_places(scene, pair, number, *where) if one_by_one else where
+            old_feature, old_force = jax.tree.map(lambda x, source=source: gather(x, source), old)
+            return matched_points(jnp.where(known[:, None], old_feature, NO_PAIR), new_feature, active, old_force)
 
-        old_feature = jnp.where(known[:, None], gather(by_point(old_feature), source), NO_PAIR)
-        old_force = old_force.map(lambda x, f=by_point, s=source: gather(f(x), s))
-        parts.append(matched_points(old_feature, by_point(new_feature), by_point(active), old_force))
+        if one_by_one:
+            parts.append(map_filled(matched, ((_key(scene, *p.pair), p.active), *found), _filled(p)))
+        else:
+            parts.append(matched((sources[number], *found)))
         slot += group.slot_count
     return parts
+
+
+def _filled(places: GroupPlaces) -> Array:
+    """() number of places that hold a pair in some world, where each pair has a turn of its own."""
+    (_, placed), *_ = places.tables
+    assert placed.places.turns is not None
+    return placed.places.turns
 
 
 def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array) -> tuple[Array, Array]:
@@ -181,6 +196,10 @@ def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair:
 
 def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, Array]]:
     """For each compact group, (place, world): its place that held the pair in the last step, and whether there was one."""
+    assert scene.broadphase is not None
+    if scene.broadphase.one_by_one:
+        places = enumerate(close.groups)
+        return [_known_places(scene, pair, number, _key(scene, *p.pair), p.active) for number, p in places]
     previous = _previous_places(scene, close.found, pair)
     sources, first = [], 0
     for group, p in zip(scene.compact_groups, close.groups, strict=True):
@@ -189,6 +208,16 @@ def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, 
         sources.append((jnp.clip(source, 0, group.place_count - 1), known))
         first += group.place_count
     return sources
+
+
+def _known_places(scene: Scene, pair: Array, number: int, key: Array, active: Array) -> tuple[Array, Array]:
+    """`_sources` of some places of the group `number`, where each pair has a turn of its own: the keys of a group ascend."""
+    counts = [group.place_count for group in scene.compact_groups]
+    first = sum(counts[:number])
+    old = take(pair, range(first, first + counts[number]))
+    old = jnp.where(old == NO_PAIR, jnp.iinfo(jnp.int32).max, old)
+    place = jnp.minimum(lower_bound(old, key), counts[number] - 1)
+    return place, active & (gather(old, place) == key)
 
 
 def _key(scene: Scene, first: Array, second: Array) -> Array:

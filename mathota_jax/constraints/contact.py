@@ -41,6 +41,7 @@ from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
 
 
@@ -67,12 +68,14 @@ class ContactRows(NamedTuple):
     Attributes:
       rows: for the velocity solver.
       lever: (turn, 1, column, world) time [s] that the contact's impulse has to act on the position.
-      directions: row directions in the world frame, components (turn * column, world).
+      directions: row directions in the world frame, components (turn * column, world); none where the matrix of the rows
+        keeps them, with the sign of the only side that moves.
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.
       size: (turn, 1, column, world) inner radius of the smaller moving body.
       falling: (turn, row, column, world) change of each row's velocity by gravity during the lever; None where no rebounds
         need a limit.
+      sign: (turn, 1, world) of the directions that the matrix keeps; None where it is +.
     """
 
     rows: Rows
@@ -82,6 +85,7 @@ class ContactRows(NamedTuple):
     slop: Array
     size: Array
     falling: Array | None = None
+    sign: Array | None = None
 
 
 class PlacedPairs(NamedTuple):
@@ -254,18 +258,7 @@ def rows_one_by_one(
 
     chosen = jax.tree.map(by_turn, select(table, contacts))
     found = map_filled(rows, (chosen, blocks, pairs._replace(places=None)), turns)
-    if isinstance(found.rows.matrix, Points):
-        sign = 1.0 if pairs.sign is None else _signs(scene, table, pairs)[0]
-        found = found._replace(directions=_unpacked(found.rows.matrix.directions, sign))
-    return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
-
-
-def _unpacked(directions: Array, sign: float | np.ndarray | Array) -> tuple[Vec3, ...]:
-    """Components (turn * column, world) of each row of what `pack_directions` gave, times a sign."""
-    turns, rows, _, columns, worlds = directions.shape
-    entries = unstack(directions.reshape(turns, 3 * rows, columns, worlds), 1)
-    flat = [entry.reshape(-1, worlds) * sign for entry in entries]
-    return tuple(Vec3(*flat[3 * row : 3 * row + 3]) for row in range(rows))
+    return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places), sign=pairs.sign)
 
 
 def _push_only(effective_mass: Array) -> Push:
@@ -353,23 +346,66 @@ def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:
     """
     table = contact.rows.table
     chosen = select(table, force)
-    impulses = [dot(chosen, direction) * dt for direction in contact.directions]
-    impulses[0] = jnp.maximum(impulses[0], 0.0)
-    return pack_scalars(table, impulses, contact.rows.bias.shape[-1])
+    if contact.directions:
+        impulses = [dot(chosen, direction) * dt for direction in contact.directions]
+        impulses[0] = jnp.maximum(impulses[0], 0.0)
+        return pack_scalars(table, impulses, contact.rows.bias.shape[-1])
+
+    def impulse(part: Rows, of_turns: tuple[Vec3, Array | None]) -> Array:
+        force, sign = of_turns
+        along = Vec3(*unstack(_directions(part), 2))
+        found = dot(force.map(lambda x: x[:, None]), along) * (dt if sign is None else dt * sign[:, None])
+        return jnp.where(np.arange(found.shape[1])[:, None, None] > 0, found, jnp.maximum(found, 0.0))
+
+    by_turn = chosen.map(lambda x: x.reshape(table.turn_count, table.column_count, -1))
+    return map_turns(impulse, contact.rows, (by_turn, contact.sign))
 
 
 def slot_force(contacts: list[ContactRows], impulses: list[Array], slot_count: int, dt: Array) -> Array:
     """(slot, 3, world) mean force on body B over the step."""
-    tables = [contact.rows.table for contact in contacts]
+    own, parts, own_count = [], [], slot_count
+    for contact, impulse in zip(contacts, impulses, strict=True):
+        table = contact.rows.table
+        if contact.directions:
+            own.append((table, _force_of_columns(contact, impulse) / dt))
+        else:
+            parts.append(_force_of_turns(contact, impulse, dt))
+            own_count -= len(parts[-1])
+    if own:
+        tables, values = zip(*own, strict=True)
+        components = [collect(tables, [value[axis] for value in values], own_count) for axis in range(3)]
+        parts.insert(0, jnp.stack(components, axis=1))
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+
+
+def _force_of_columns(contact: ContactRows, impulse: Array) -> Vec3:
+    """Impulses as vectors, components (turn, column, world)."""
+    turns, _, columns, worlds = impulse.shape
     components = []
     for axis in range(3):
-        values = []
-        for contact, impulse in zip(contacts, impulses, strict=True):
-            turns, _, columns, worlds = impulse.shape
-            total = jnp.zeros((turns, columns, worlds), impulse.dtype)
-            for row, direction in enumerate(contact.directions):
-                full = jnp.broadcast_to(direction[axis], (turns * columns, worlds)).reshape(turns, columns, worlds)
-                total = total + full * impulse[:, row]
-            values.append(total / dt)
-        components.append(collect(tables, values, slot_count))
-    return jnp.stack(components, axis=1)
+        total = jnp.zeros((turns, columns, worlds), impulse.dtype)
+        for row, direction in enumerate(contact.directions):
+            full = jnp.broadcast_to(direction[axis], (turns * columns, worlds)).reshape(turns, columns, worlds)
+            total = total + full * impulse[:, row]
+        components.append(total)
+    return Vec3(*components)
+
+
+def _force_of_turns(contact: ContactRows, impulse: Array, dt: Array) -> Array:
+    """(turn * column, 3, world) of contacts that keep their directions in the matrix of their rows."""
+
+    def force(part: Rows, of_turns: tuple[Array, Array | None]) -> Array:
+        impulse, sign = of_turns
+        along = _directions(part)
+        total = add_slices(along * spread(impulse[:, :, None], along.shape), 1)
+        total = total / dt if sign is None else total * (sign / dt)[:, None]
+        return jnp.swapaxes(total, 1, 2)
+
+    found = map_turns(force, contact.rows, (impulse, contact.sign))
+    return found.reshape(-1, *found.shape[2:])
+
+
+def _directions(rows: Rows) -> Array:
+    """(turn, row, 3, column, world), with the sign of the only side."""
+    assert isinstance(rows.matrix, Points)
+    return rows.matrix.directions

@@ -60,7 +60,7 @@ def matched_force(
       force: (slot, 3, world) where they were then.
     """
     old, feature = vector(force), state.contact_feature
-    parts = warm_start.matched_force(scene, contacts, old, feature)
+    parts = compute_once(warm_start.matched_force(scene, contacts, old, feature), force)
     if close is not None:
         assert state.contact_pair is not None
         parts += compact.matched_force(scene, close, contacts, old, feature, state.contact_pair)
