@@ -150,8 +150,9 @@ def matched_force(
         def matched(places: tuple, number: int = number, old: tuple[Array, Vec3] = old) -> Vec3:
             where, new_feature, active = places
             source, known = _known_places(scene, pair, number, *where) if one_by_one else where
-            old_feature, old_force = jax.tree.map(lambda x, source=source: gather(x, source), old)
-            return matched_points(jnp.where(known[:, None], old_feature, NO_PAIR), new_feature, active, old_force)
+            old_feature, *old_force = [gather(x, source) for x in jax.tree.leaves(old)]
+            old_feature = jnp.where(known[:, None], old_feature, NO_PAIR)
+            return matched_points(old_feature, new_feature, active, Vec3(*old_force))
 
         if one_by_one:
             parts.append(map_filled(matched, ((_key(scene, *p.pair), p.active), *found), _filled(p)))
