@@ -6,6 +6,8 @@ again in the next step by its pair, so that impulses carry over (guide 7.3).
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -18,8 +20,8 @@ from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.broadphase.ranges import lower_bound
 from mathota_jax.collision.compact import compact_contacts
-from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints.contact import PlacedPairs
+from mathota_jax.collision.narrowphase import ContactSet, stored
+from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
 from mathota_jax.constraints.warm_start import matched_points
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
@@ -95,19 +97,44 @@ def _turns_matter(scene: Scene, model: Model) -> bool:
 
 def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:
     """Runs the narrow phase for the close pairs, a set for each compact group."""
-    scene, found = model.scene, []
+    scene = model.scene
     assert scene.broadphase is not None
+    sets = []
     for group, places in zip(scene.compact_groups, close.groups, strict=True):
+        contacts, pairs = _narrow_phase(model, group, bodies), (places.pair, places.active)
+        sets.append(map_filled(contacts, pairs, _filled(places)) if scene.broadphase.one_by_one else contacts(pairs))
+    return sets
 
-        def contacts(pairs: tuple, group: CompactGroup = group) -> ContactSet:
-            return compact_contacts(scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
 
-        pairs = (places.pair, places.active)
-        if scene.broadphase.one_by_one:
-            found.append(map_filled(contacts, pairs, _filled(places)))
-        else:
-            found.append(contacts(pairs))
-    return found
+def contacts_and_rows(
+    model: Model, bodies: Bodies, close: ClosePairs, motion: Motion
+) -> tuple[list[ContactSet], list[ContactRows]]:
+    """`contacts_of`, and the rows of the contacts."""
+    scene = model.scene
+    assert scene.broadphase is not None
+    if scene.broadphase.one_by_one:
+        both = []
+        for group, places in zip(scene.compact_groups, close.groups, strict=True):
+            (table, placed), *_ = places.tables
+            found = _narrow_phase(model, group, bodies)
+            both.append(rows_one_by_one(scene, table, model, found, (places.pair, places.active), motion, placed))
+        sets, rows = zip(*both, strict=True)
+        return list(sets), list(rows)
+    sets, rows = contacts_of(model, bodies, close), []
+    for places, contacts in zip(close.groups, sets, strict=True):
+        first = places.tables[0][0].first_slot
+        for table, placed in places.tables:
+            of_group = dataclasses.replace(table, first_slot=table.first_slot - first)
+            found = contact_rows(scene, of_group, model, stored(contacts, bodies.position.x), motion, placed)
+            rows.append(found._replace(rows=dataclasses.replace(found.rows, table=table)))
+    return sets, rows
+
+
+def _narrow_phase(model: Model, group: CompactGroup, bodies: Bodies) -> Callable[[tuple], ContactSet]:
+    def contacts(pairs: tuple) -> ContactSet:
+        return compact_contacts(model.scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
+
+    return contacts
 
 
 def pair_keys(scene: Scene, close: ClosePairs) -> Array:

@@ -9,8 +9,8 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import InverseInertia, pack_blocks, smaller_moving
-from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
+from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet, stored
 from mathota_jax.constraints.assembly import (
     collect,
     gather_columns,
@@ -239,26 +239,33 @@ def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> A
 
 
 def rows_one_by_one(
-    scene: Scene, table: TracedTable, model: Model, contacts: ContactSet, motion: Motion, pairs: PlacedPairs
-) -> ContactRows:
-    """`contact_rows` of a table with one pair a turn, without those of the turns that hold none (they are 0)."""
+    scene: Scene,
+    table: TracedTable,
+    model: Model,
+    contacts: Callable[[tuple], ContactSet],
+    shapes: tuple,
+    motion: Motion,
+    pairs: PlacedPairs,
+) -> tuple[ContactSet, ContactRows]:
+    """Contacts and their rows of a table with one pair a turn, 0 in the turns that hold none.
+
+    `contacts` finds those of some places from `shapes`, a pytree of arrays (place, world).
+    """
     blocks, turns = pairs.places.blocks, pairs.places.turns
     assert turns is not None
 
-    def by_turn(values: Array) -> Array:
-        return values.reshape(table.turn_count, -1, *values.shape[1:])
-
-    def rows(of_turns: tuple[ContactSet, tuple[Array, ...], PlacedPairs]) -> ContactRows:
-        chosen, blocks, pairs = of_turns
-        chosen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), chosen)
+    def rows(of_turns: tuple[Any, tuple[Array, ...], PlacedPairs]) -> tuple[ContactSet, ContactRows]:
+        shapes, blocks, pairs = of_turns
+        chosen = stored(contacts(shapes), motion.velocity)
         part = dataclasses.replace(table, turn_count=blocks[0].shape[0], first_slot=0)
         found = contact_rows(scene, part, model, chosen, motion, pairs._replace(places=Places(blocks, None)))
         found = found._replace(rows=dataclasses.replace(found.rows, places=None))
-        return found._replace(directions=()) if isinstance(found.rows.matrix, Points) else found
+        return chosen, found._replace(directions=()) if isinstance(found.rows.matrix, Points) else found
 
-    chosen = jax.tree.map(by_turn, select(table, contacts))
-    found = map_filled(rows, (chosen, blocks, pairs._replace(places=None)), turns)
-    return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places), sign=pairs.sign)
+    chosen, found = map_filled(rows, (shapes, blocks, pairs._replace(places=None)), turns)
+    return chosen, found._replace(
+        rows=dataclasses.replace(found.rows, table=table, places=pairs.places), sign=pairs.sign
+    )
 
 
 def _push_only(effective_mass: Array) -> Push:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.bodies import Bodies, vector
-from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
+from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts, stored
 from mathota_jax.constraints import compact, warm_start
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -25,15 +25,18 @@ def find_slots(
       bodies: all bodies.
       free: as for `compact.close_pairs`.
     """
-    scene, found, close = model.scene, [], None
-    if scene.pair_groups:
-        own = find_contacts(scene, model.shapes, bodies.position, bodies.orientation)
-        stored = {"position": own.position, "normal": own.normal, "separation": own.separation}
-        found.append(own._replace(**compute_once(stored, bodies.position.x)))
+    scene, found, close = model.scene, own_contacts(model, bodies), None
     if scene.broadphase is not None:
         close = compact.close_pairs(model, bodies, free)
         found += compact.contacts_of(model, bodies, close)
     return join_contacts(found), close
+
+
+def own_contacts(model: Model, bodies: Bodies) -> list[ContactSet]:
+    """Contacts of the pairs that have slots of their own: one set, or none."""
+    if not model.scene.pair_groups:
+        return []
+    return [stored(find_contacts(model.scene, model.shapes, bodies.position, bodies.orientation), bodies.position.x)]
 
 
 def bodies_of_slots(scene: Scene, close: compact.ClosePairs | None) -> tuple[Array, Array]:
