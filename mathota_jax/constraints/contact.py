@@ -229,7 +229,7 @@ def _points(
         surface = contacts.position + contacts.normal * (jnp.maximum(contacts.separation, 0.0) * (0.5 * sign))
         arm = compute_once(surface - position, contacts.separation)
         angular.append(turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds))
-    return Points(packed, tuple(angular), tuple(inertias))
+    return Points(jnp.concatenate([packed, *angular], axis=2), tuple(inertias))
 
 
 def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> Array:
