@@ -169,7 +169,7 @@ class Points:
 class FirstRow:
     """The first row of each constraint of other rows, taken out where it is used: a copy for all turns takes longer."""
 
-    whole: Dense | Points
+    whole: RowMatrix
 
     @property
     def like(self) -> Array:
