@@ -20,7 +20,7 @@ from mathota_jax.model import Model
 from mathota_jax.outcome import merge
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
-from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity
+from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.settle import compute_once, store_cotangents
 from mathota_jax.spatial.vector import Vec3
@@ -187,8 +187,7 @@ def correct_positions(
                 problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
             )
     for group in problem.contact_rows:
-        change = first_row_velocity(group.rows, packed)
-        rows.append(contact.position_rows(group, change, options.position_percent))
+        rows.append(contact.position_rows(group, packed, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)

@@ -12,6 +12,7 @@ from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.placement import shape_parameters, shape_poses
 from mathota_jax.scene import PairGroup, Scene
 from mathota_jax.spatial.quaternion import Quaternion
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 
 SPECULATIVE = 0.5
@@ -47,6 +48,12 @@ def find_contacts(
       position, orientation: of all bodies, components (body, world).
     """
     return join_contacts([group_contacts(scene, group, shapes, position, orientation) for group in scene.pair_groups])
+
+
+def stored(contacts: ContactSet, like: Array) -> ContactSet:
+    """The contacts, what rows are made of being computed once; `like` as for `compute_once`."""
+    values = {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation}
+    return contacts._replace(**compute_once(values, like))
 
 
 def join_contacts(groups: list[ContactSet]) -> ContactSet:

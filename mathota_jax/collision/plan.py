@@ -86,7 +86,7 @@ def plan_broadphase(
 
 
 def _capacity(pair_count: int, moving: int, options: Options) -> int:
-    """Pairs that the list has room for; places that stay empty cost, in a pile of 27 boxes as much as those in use."""
+    """Pairs that the list has room for."""
     everything = pair_count if pair_count <= ONE_BY_ONE_UP_TO else max(PAIRS_PER_SHAPE * moving, FEWEST_PAIRS)
     return min(options.pair_capacity or everything, pair_count)
 

@@ -6,8 +6,11 @@ again in the next step by its pair, so that impulses carry over (guide 7.3).
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -17,8 +20,8 @@ from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.broadphase.ranges import lower_bound
 from mathota_jax.collision.compact import compact_contacts
-from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints.contact import PlacedPairs
+from mathota_jax.collision.narrowphase import ContactSet, stored
+from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
 from mathota_jax.constraints.warm_start import matched_points
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
@@ -94,21 +97,44 @@ def _turns_matter(scene: Scene, model: Model) -> bool:
 
 def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:
     """Runs the narrow phase for the close pairs, a set for each compact group."""
-    scene, found = model.scene, []
+    scene = model.scene
     assert scene.broadphase is not None
+    sets = []
     for group, places in zip(scene.compact_groups, close.groups, strict=True):
+        contacts, pairs = _narrow_phase(model, group, bodies), (places.pair, places.active)
+        sets.append(map_filled(contacts, pairs, _filled(places)) if scene.broadphase.one_by_one else contacts(pairs))
+    return sets
 
-        def contacts(pairs: tuple, group: CompactGroup = group) -> ContactSet:
-            return compact_contacts(scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
 
-        pairs = (places.pair, places.active)
-        if scene.broadphase.one_by_one:
-            (_, placed), *_ = places.tables
-            assert placed.places.turns is not None
-            found.append(map_filled(contacts, pairs, placed.places.turns))
-        else:
-            found.append(contacts(pairs))
-    return found
+def contacts_and_rows(
+    model: Model, bodies: Bodies, close: ClosePairs, motion: Motion
+) -> tuple[list[ContactSet], list[ContactRows]]:
+    """`contacts_of`, and the rows of the contacts."""
+    scene = model.scene
+    assert scene.broadphase is not None
+    if scene.broadphase.one_by_one:
+        both = []
+        for group, places in zip(scene.compact_groups, close.groups, strict=True):
+            (table, placed), *_ = places.tables
+            found = _narrow_phase(model, group, bodies)
+            both.append(rows_one_by_one(scene, table, model, found, (places.pair, places.active), motion, placed))
+        sets, rows = zip(*both, strict=True)
+        return list(sets), list(rows)
+    sets, rows = contacts_of(model, bodies, close), []
+    for places, contacts in zip(close.groups, sets, strict=True):
+        first = places.tables[0][0].first_slot
+        for table, placed in places.tables:
+            of_group = dataclasses.replace(table, first_slot=table.first_slot - first)
+            found = contact_rows(scene, of_group, model, stored(contacts, bodies.position.x), motion, placed)
+            rows.append(found._replace(rows=dataclasses.replace(found.rows, table=table)))
+    return sets, rows
+
+
+def _narrow_phase(model: Model, group: CompactGroup, bodies: Bodies) -> Callable[[tuple], ContactSet]:
+    def contacts(pairs: tuple) -> ContactSet:
+        return compact_contacts(model.scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
+
+    return contacts
 
 
 def pair_keys(scene: Scene, close: ClosePairs) -> Array:
@@ -138,19 +164,36 @@ def matched_force(
       scene, close, contacts: static structure, and what is close in this step; all slots.
       force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
     """
+    assert scene.broadphase is not None
+    one_by_one = scene.broadphase.one_by_one
+    sources = [] if one_by_one else _sources(scene, close, pair)
     parts, slot = [], scene.static_slot_count
-    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
+    for number, (group, p) in enumerate(zip(scene.compact_groups, close.groups, strict=True)):
         rows = range(slot, slot + group.slot_count)
-        old_feature, new_feature, old_force, active = take((feature, contacts.feature, force, contacts.active), rows)
+        shape = (group.place_count, group.point_count, -1)
+        found = [x.reshape(shape) for x in take((contacts.feature, contacts.active), rows)]
+        old = jax.tree.map(lambda x, shape=shape: x.reshape(shape), take((feature, force), rows))
 
-        def by_point(values: Array, count: int = group.point_count) -> Array:
-            return values.reshape(-1, count, values.shape[-1])
+        def matched(places: tuple, number: int = number, old: tuple[Array, Vec3] = old) -> Vec3:
+            where, new_feature, active = places
+            source, known = _known_places(scene, pair, number, *where) if one_by_one else where
+            old_feature, *old_force = [gather(x, source) for x in jax.tree.leaves(old)]
+            old_feature = jnp.where(known[:, None], old_feature, NO_PAIR)
+            return matched_points(old_feature, new_feature, active, Vec3(*old_force))
 
-        old_feature = jnp.where(known[:, None], gather(by_point(old_feature), source), NO_PAIR)
-        old_force = old_force.map(lambda x, f=by_point, s=source: gather(f(x), s))
-        parts.append(matched_points(old_feature, by_point(new_feature), by_point(active), old_force))
+        if one_by_one:
+            parts.append(map_filled(matched, ((_key(scene, *p.pair), p.active), *found), _filled(p)))
+        else:
+            parts.append(matched((sources[number], *found)))
         slot += group.slot_count
     return parts
+
+
+def _filled(places: GroupPlaces) -> Array:
+    """() number of places that hold a pair in some world, where each pair has a turn of its own."""
+    (_, placed), *_ = places.tables
+    assert placed.places.turns is not None
+    return placed.places.turns
 
 
 def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array) -> tuple[Array, Array]:
@@ -181,6 +224,10 @@ def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair:
 
 def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, Array]]:
     """For each compact group, (place, world): its place that held the pair in the last step, and whether there was one."""
+    assert scene.broadphase is not None
+    if scene.broadphase.one_by_one:
+        places = enumerate(close.groups)
+        return [_known_places(scene, pair, number, _key(scene, *p.pair), p.active) for number, p in places]
     previous = _previous_places(scene, close.found, pair)
     sources, first = [], 0
     for group, p in zip(scene.compact_groups, close.groups, strict=True):
@@ -189,6 +236,16 @@ def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, 
         sources.append((jnp.clip(source, 0, group.place_count - 1), known))
         first += group.place_count
     return sources
+
+
+def _known_places(scene: Scene, pair: Array, number: int, key: Array, active: Array) -> tuple[Array, Array]:
+    """`_sources` of some places of the group `number`, where each pair has a turn of its own: the keys of a group ascend."""
+    counts = [group.place_count for group in scene.compact_groups]
+    first = sum(counts[:number])
+    old = take(pair, range(first, first + counts[number]))
+    old = jnp.where(old == NO_PAIR, jnp.iinfo(jnp.int32).max, old)
+    place = jnp.minimum(lower_bound(old, key), counts[number] - 1)
+    return place, active & (gather(old, place) == key)
 
 
 def _key(scene: Scene, first: Array, second: Array) -> Array:
@@ -228,7 +285,7 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
             column = jnp.arange(tier.pair_count, dtype=jnp.int32)[None, :, None]
             held.append((column < counts[rows][:, None]).reshape(-1, worlds))
             position = jnp.minimum(starts[rows][:, None] + column, capacity - 1).reshape(-1, worlds)
-            listed.append(gather(sorted_pairs, position))
+            listed.append(position if sorted_pairs is None else gather(sorted_pairs, position))
             lost |= (counts[rows] > tier.pair_count).any(0)
             tables.append(TracedTable(tier.turn_count, tier.pair_count, group.point_count, slot, block_count))
             sizes.append(jnp.clip(used - first_turn, 0, tier.turn_count))
@@ -239,19 +296,23 @@ def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
     return groups, lost
 
 
-def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array, Array, Array]:
+def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array | None, Array, Array]:
     """Listed pairs sorted by turn, those of all groups; how many each turn holds, and where in the order they begin.
 
-    Each group has one turn more than it has places for: what is there is lost.
+    The order is None where it is that of the list. Each group has one turn more than it has places for: what is there is
+    lost.
     """
     turn_count, capacity, active = max(turn_counts), found.first.shape[0], found.active
     assert scene.broadphase is not None
-    if scene.broadphase.one_by_one and len(scene.compact_groups) == 1:
-        # The list has no gaps: each pair has the turn of its own number.
-        order, turns = jnp.arange(capacity, dtype=jnp.int32), jnp.arange(turn_count + 1, dtype=jnp.int32)[:, None]
-        counts = (turns < found.count).astype(jnp.int32)
-        return jnp.broadcast_to(order[:, None], active.shape), counts, jnp.broadcast_to(turns, counts.shape)
-    group_of_pair = _group_codes(scene)[found.first, found.second] if len(scene.compact_groups) > 1 else 0
+    several = len(scene.compact_groups) > 1
+    group_of_pair = jnp.asarray(_group_codes(scene))[found.first, found.second] if several else 0
+    if _in_list_order(scene):
+        # The list has no gaps: each pair has the turn of its number in its group.
+        turns = jnp.arange(turn_count + 1, dtype=jnp.int32)[:, None]
+        sizes = [(active & (group_of_pair == group)).sum(0, dtype=jnp.int32) for group in range(len(turn_counts))]
+        counts = [(turns < size).astype(jnp.int32) for size in sizes]
+        starts = [turns + sum(sizes[:group], jnp.zeros_like(found.count)) for group in range(len(sizes))]
+        return None, jnp.concatenate(counts), jnp.concatenate(starts)
     if scene.broadphase.one_by_one:
         colour = _ranks(group_of_pair, active, len(turn_counts))
     else:
@@ -270,6 +331,13 @@ def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array
     counts = jnp.zeros((len(turn_counts) * (turn_count + 1), worlds), jnp.int32)
     counts = counts.at[code, jnp.arange(worlds)].add(1, mode="drop")
     return sorted_pairs, counts, jnp.cumsum(counts, axis=0) - counts
+
+
+def _in_list_order(scene: Scene) -> bool:
+    """Whether each pair has a turn of its own, and those of a group follow one another in the list."""
+    assert scene.broadphase is not None
+    codes = _group_codes(scene)[admissible_pairs(scene).pairs]
+    return scene.broadphase.one_by_one and bool((np.diff(codes) >= 0).all())
 
 
 def _blocks(scene: Scene) -> Array:
@@ -336,7 +404,7 @@ def _moving_shapes(scene: Scene) -> np.ndarray:
     return ~np.asarray(admissible_pairs(scene).static)
 
 
-def _group_codes(scene: Scene) -> Array:
+def _group_codes(scene: Scene) -> np.ndarray:
     """(shape, shape) group of each pair of shapes; 0 for pairs that are never listed."""
     assert scene.broadphase is not None
     kinds = [scene.shapes[entry].kind for entry in scene.broadphase.shapes]
@@ -345,7 +413,7 @@ def _group_codes(scene: Scene) -> Array:
     codes = np.zeros((len(names), len(names), 3), np.int32)
     for number, group in enumerate(scene.compact_groups):
         codes[names.index(group.kind_a), names.index(group.kind_b), group.side_count] = number
-    return jnp.asarray(codes[kind[:, None], kind[None, :], moving[:, None] + moving[None, :]])
+    return codes[kind[:, None], kind[None, :], moving[:, None] + moving[None, :]]
 
 
 def _example(scene: Scene, group: CompactGroup) -> tuple[int, int]:

@@ -9,8 +9,8 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import InverseInertia, pack_blocks, smaller_moving
-from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet
+from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet, stored
 from mathota_jax.constraints.assembly import (
     collect,
     gather_columns,
@@ -34,13 +34,14 @@ from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Cone, Push
-from mathota_jax.solver.row_matrix import Points
-from mathota_jax.solver.rows import Places, Rows, matrix_velocity
+from mathota_jax.solver.row_matrix import FirstRow, Points
+from mathota_jax.solver.rows import Places, Rows, map_turns, matrix_velocity, row_velocity
 from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
 
 
@@ -67,12 +68,14 @@ class ContactRows(NamedTuple):
     Attributes:
       rows: for the velocity solver.
       lever: (turn, 1, column, world) time [s] that the contact's impulse has to act on the position.
-      directions: row directions in the world frame, components (turn * column, world).
+      directions: row directions in the world frame, components (turn * column, world); none where the matrix of the rows
+        keeps them, with the sign of the only side that moves.
       separation: (turn, 1, column, world) at the start of the step.
       slop: (turn, 1, column, world) penetration left alone.
       size: (turn, 1, column, world) inner radius of the smaller moving body.
       falling: (turn, row, column, world) change of each row's velocity by gravity during the lever; None where no rebounds
         need a limit.
+      sign: (turn, 1, world) of the directions that the matrix keeps; None where it is +.
     """
 
     rows: Rows
@@ -82,6 +85,7 @@ class ContactRows(NamedTuple):
     slop: Array
     size: Array
     falling: Array | None = None
+    sign: Array | None = None
 
 
 class PlacedPairs(NamedTuple):
@@ -162,7 +166,7 @@ def contact_rows(
         target, lever = rebound(approach, model.dt, model.dt * (1.0 + 1.0 / scene.options.substep_count))
     else:
         target, lever = impact(approach, model.dt)
-    active = pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0]
+    active = compute_once(pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0], normal.x)
     # Empty columns of a table have no response.
     entries = entries_of(matrix.dense())
     mass = safe_divide(active, normal_bound(entries, table.together, active))
@@ -225,7 +229,7 @@ def _points(
         surface = contacts.position + contacts.normal * (jnp.maximum(contacts.separation, 0.0) * (0.5 * sign))
         arm = compute_once(surface - position, contacts.separation)
         angular.append(turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds))
-    return Points(packed, tuple(angular), tuple(inertias))
+    return Points(jnp.concatenate([packed, *angular], axis=2), tuple(inertias))
 
 
 def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> Array:
@@ -235,37 +239,33 @@ def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> A
 
 
 def rows_one_by_one(
-    scene: Scene, table: TracedTable, model: Model, contacts: ContactSet, motion: Motion, pairs: PlacedPairs
-) -> ContactRows:
-    """`contact_rows` of a table with one pair a turn, without those of the turns that hold none (they are 0)."""
+    scene: Scene,
+    table: TracedTable,
+    model: Model,
+    contacts: Callable[[tuple], ContactSet],
+    shapes: tuple,
+    motion: Motion,
+    pairs: PlacedPairs,
+) -> tuple[ContactSet, ContactRows]:
+    """Contacts and their rows of a table with one pair a turn, 0 in the turns that hold none.
+
+    `contacts` finds those of some places from `shapes`, a pytree of arrays (place, world).
+    """
     blocks, turns = pairs.places.blocks, pairs.places.turns
     assert turns is not None
 
-    def by_turn(values: Array) -> Array:
-        return values.reshape(table.turn_count, -1, *values.shape[1:])
-
-    def rows(of_turns: tuple[ContactSet, tuple[Array, ...], PlacedPairs]) -> ContactRows:
-        chosen, blocks, pairs = of_turns
-        chosen = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), chosen)
+    def rows(of_turns: tuple[Any, tuple[Array, ...], PlacedPairs]) -> tuple[ContactSet, ContactRows]:
+        shapes, blocks, pairs = of_turns
+        chosen = stored(contacts(shapes), motion.velocity)
         part = dataclasses.replace(table, turn_count=blocks[0].shape[0], first_slot=0)
         found = contact_rows(scene, part, model, chosen, motion, pairs._replace(places=Places(blocks, None)))
         found = found._replace(rows=dataclasses.replace(found.rows, places=None))
-        return found._replace(directions=()) if isinstance(found.rows.matrix, Points) else found
+        return chosen, found._replace(directions=()) if isinstance(found.rows.matrix, Points) else found
 
-    chosen = jax.tree.map(by_turn, select(table, contacts))
-    found = map_filled(rows, (chosen, blocks, pairs._replace(places=None)), turns)
-    if isinstance(found.rows.matrix, Points):
-        sign = 1.0 if pairs.sign is None else _signs(scene, table, pairs)[0]
-        found = found._replace(directions=_unpacked(found.rows.matrix.directions, sign))
-    return found._replace(rows=dataclasses.replace(found.rows, table=table, places=pairs.places))
-
-
-def _unpacked(directions: Array, sign: float | np.ndarray | Array) -> tuple[Vec3, ...]:
-    """Components (turn * column, world) of each row of what `pack_directions` gave, times a sign."""
-    turns, rows, _, columns, worlds = directions.shape
-    entries = unstack(directions.reshape(turns, 3 * rows, columns, worlds), 1)
-    flat = [entry.reshape(-1, worlds) * sign for entry in entries]
-    return tuple(Vec3(*flat[3 * row : 3 * row + 3]) for row in range(rows))
+    chosen, found = map_filled(rows, (shapes, blocks, pairs._replace(places=None)), turns)
+    return chosen, found._replace(
+        rows=dataclasses.replace(found.rows, table=table, places=pairs.places), sign=pairs.sign
+    )
 
 
 def _push_only(effective_mass: Array) -> Push:
@@ -328,23 +328,21 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
 
     Args:
       contact: rows of one table.
-      displacement: (turn, 1, column, world) change of the separation in this step.
+      displacement: (component, block, world) of the moving bodies in this step.
       percent: share of the overlap beyond the slop that is corrected.
     """
-    rows = contact.rows
-    # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never that
-    # the overlap went beyond the body's middle.
-    error = (
-        jnp.maximum(contact.separation + displacement, jnp.minimum(contact.separation, -contact.size)) + contact.slop
-    )
-    mass = normal_mass(rows)
-    return Rows(
-        matrix=rows.matrix.first_row(),
-        bias=jnp.where(error < 0, percent * error, error),
-        law=_push_only(mass),
-        table=rows.table,
-        places=rows.places,
-    )
+    rows, first = contact.rows, FirstRow(contact.rows.matrix)
+
+    def bias(part: Rows, levels: tuple[Array, Array, Array]) -> Array:
+        separation, slop, size = levels
+        # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never
+        # that the overlap went beyond the body's middle.
+        error = jnp.maximum(separation + row_velocity(part, displacement), jnp.minimum(separation, -size)) + slop
+        return jnp.where(error < 0, percent * error, error)
+
+    firsts = dataclasses.replace(rows, matrix=first, law=_push_only(normal_mass(rows)))
+    levels = (contact.separation, contact.slop, contact.size)
+    return dataclasses.replace(firsts, bias=map_turns(bias, firsts, levels))
 
 
 def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:
@@ -355,23 +353,66 @@ def warm_start_impulse(contact: ContactRows, force: Vec3, dt: Array) -> Array:
     """
     table = contact.rows.table
     chosen = select(table, force)
-    impulses = [dot(chosen, direction) * dt for direction in contact.directions]
-    impulses[0] = jnp.maximum(impulses[0], 0.0)
-    return pack_scalars(table, impulses, contact.rows.bias.shape[-1])
+    if contact.directions:
+        impulses = [dot(chosen, direction) * dt for direction in contact.directions]
+        impulses[0] = jnp.maximum(impulses[0], 0.0)
+        return pack_scalars(table, impulses, contact.rows.bias.shape[-1])
+
+    def impulse(part: Rows, of_turns: tuple[Vec3, Array | None]) -> Array:
+        force, sign = of_turns
+        along = Vec3(*unstack(_directions(part), 2))
+        found = dot(force.map(lambda x: x[:, None]), along) * (dt if sign is None else dt * sign[:, None])
+        return jnp.where(np.arange(found.shape[1])[:, None, None] > 0, found, jnp.maximum(found, 0.0))
+
+    by_turn = chosen.map(lambda x: x.reshape(table.turn_count, table.column_count, -1))
+    return map_turns(impulse, contact.rows, (by_turn, contact.sign))
 
 
 def slot_force(contacts: list[ContactRows], impulses: list[Array], slot_count: int, dt: Array) -> Array:
     """(slot, 3, world) mean force on body B over the step."""
-    tables = [contact.rows.table for contact in contacts]
+    own, parts, own_count = [], [], slot_count
+    for contact, impulse in zip(contacts, impulses, strict=True):
+        table = contact.rows.table
+        if contact.directions:
+            own.append((table, _force_of_columns(contact, impulse) / dt))
+        else:
+            parts.append(_force_of_turns(contact, impulse, dt))
+            own_count -= len(parts[-1])
+    if own:
+        tables, values = zip(*own, strict=True)
+        components = [collect(tables, [value[axis] for value in values], own_count) for axis in range(3)]
+        parts.insert(0, jnp.stack(components, axis=1))
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+
+
+def _force_of_columns(contact: ContactRows, impulse: Array) -> Vec3:
+    """Impulses as vectors, components (turn, column, world)."""
+    turns, _, columns, worlds = impulse.shape
     components = []
     for axis in range(3):
-        values = []
-        for contact, impulse in zip(contacts, impulses, strict=True):
-            turns, _, columns, worlds = impulse.shape
-            total = jnp.zeros((turns, columns, worlds), impulse.dtype)
-            for row, direction in enumerate(contact.directions):
-                full = jnp.broadcast_to(direction[axis], (turns * columns, worlds)).reshape(turns, columns, worlds)
-                total = total + full * impulse[:, row]
-            values.append(total / dt)
-        components.append(collect(tables, values, slot_count))
-    return jnp.stack(components, axis=1)
+        total = jnp.zeros((turns, columns, worlds), impulse.dtype)
+        for row, direction in enumerate(contact.directions):
+            full = jnp.broadcast_to(direction[axis], (turns * columns, worlds)).reshape(turns, columns, worlds)
+            total = total + full * impulse[:, row]
+        components.append(total)
+    return Vec3(*components)
+
+
+def _force_of_turns(contact: ContactRows, impulse: Array, dt: Array) -> Array:
+    """(turn * column, 3, world) of contacts that keep their directions in the matrix of their rows."""
+
+    def force(part: Rows, of_turns: tuple[Array, Array | None]) -> Array:
+        impulse, sign = of_turns
+        along = _directions(part)
+        total = add_slices(along * spread(impulse[:, :, None], along.shape), 1)
+        total = total / dt if sign is None else total * (sign / dt)[:, None]
+        return jnp.swapaxes(total, 1, 2)
+
+    found = map_turns(force, contact.rows, (impulse, contact.sign))
+    return found.reshape(-1, *found.shape[2:])
+
+
+def _directions(rows: Rows) -> Array:
+    """(turn, row, 3, column, world), with the sign of the only side."""
+    assert isinstance(rows.matrix, Points)
+    return rows.matrix.directions

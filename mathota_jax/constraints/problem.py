@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia, moving, of_all_bodies, vector
-from mathota_jax.collision.narrowphase import ContactSet
+from mathota_jax.collision.narrowphase import ContactSet, join_contacts
 from mathota_jax.constraints import (
     compact,
     contact,
@@ -22,7 +22,7 @@ from mathota_jax.constraints import (
     substep_rows,
     warm_start,
 )
-from mathota_jax.constraints.slots import find_slots, matched_force
+from mathota_jax.constraints.slots import matched_force, own_contacts
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.soft_step import PositionError
@@ -104,30 +104,21 @@ def constrain(
             errors = tuple(substep_rows.joint_error(scene, rows, model, joint_motion) for rows in tables)
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
-        contacts, close = find_slots(model, bodies, free)
-        contacts = contacts._replace(
-            **compute_once(
-                {"position": contacts.position, "normal": contacts.normal, "separation": contacts.separation},
-                state.position,
-            )
-        )
+        found = own_contacts(model, bodies)
         if scene.options.continuous:
-            contacts = contact.near_contacts(scene, model, contacts)
+            found = [contact.near_contacts(scene, model, own) for own in found]
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
         then = contact.pack_motion(scene, *free)
         inverse = compute_once(inertia.inverse(), state.position)
         motion = contact.Motion(blocks.position, now, then, inverse, gravity)
         contact_rows = [
-            contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)
+            contact.contact_rows(scene, table, model, found[0], motion) for table in contact.contact_tables(scene)
         ]
-        rows_of_places = (
-            contact.rows_one_by_one if scene.broadphase and scene.broadphase.one_by_one else contact.contact_rows
-        )
-        contact_rows += [
-            rows_of_places(scene, table, model, contacts, motion, pairs)
-            for group in (close.groups if close else ())
-            for table, pairs in group.tables
-        ]
+        if scene.broadphase is not None:
+            close = compact.close_pairs(model, bodies, free)
+            sets, more = compact.contacts_and_rows(model, bodies, close, motion)
+            found, contact_rows = found + sets, contact_rows + more
+        contacts = join_contacts(found)
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
     return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors)
@@ -146,7 +137,7 @@ def starting_impulses(
     if problem.contacts is None:
         return _impulses(model, problem, last.joint_force, None), None
     force = matched_force(model.scene, problem.contacts, problem.close, state, last.contact_force)
-    start = _impulses(model, problem, last.joint_force, compute_once(force, state.position))
+    start = _impulses(model, problem, last.joint_force, force)
     if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
         return warm_start.plausible(problem.rows, inertia, velocity, start)
     return start, None

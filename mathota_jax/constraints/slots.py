@@ -6,10 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.bodies import Bodies, vector
-from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts
+from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts, stored
 from mathota_jax.constraints import compact, warm_start
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
+from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
 
@@ -24,13 +25,18 @@ def find_slots(
       bodies: all bodies.
       free: as for `compact.close_pairs`.
     """
-    scene, found, close = model.scene, [], None
-    if scene.pair_groups:
-        found.append(find_contacts(scene, model.shapes, bodies.position, bodies.orientation))
+    scene, found, close = model.scene, own_contacts(model, bodies), None
     if scene.broadphase is not None:
         close = compact.close_pairs(model, bodies, free)
         found += compact.contacts_of(model, bodies, close)
     return join_contacts(found), close
+
+
+def own_contacts(model: Model, bodies: Bodies) -> list[ContactSet]:
+    """Contacts of the pairs that have slots of their own: one set, or none."""
+    if not model.scene.pair_groups:
+        return []
+    return [stored(find_contacts(model.scene, model.shapes, bodies.position, bodies.orientation), bodies.position.x)]
 
 
 def bodies_of_slots(scene: Scene, close: compact.ClosePairs | None) -> tuple[Array, Array]:
@@ -57,7 +63,7 @@ def matched_force(
       force: (slot, 3, world) where they were then.
     """
     old, feature = vector(force), state.contact_feature
-    parts = warm_start.matched_force(scene, contacts, old, feature)
+    parts = compute_once(warm_start.matched_force(scene, contacts, old, feature), force)
     if close is not None:
         assert state.contact_pair is not None
         parts += compact.matched_force(scene, close, contacts, old, feature, state.contact_pair)

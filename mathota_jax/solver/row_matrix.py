@@ -54,7 +54,7 @@ class Dense:
 
     def first_row(self) -> Dense:
         """That of the first row of each constraint alone."""
-        return Dense(tuple(side[:, :1] for side in self.jacobian), tuple(side[:, :1] for side in self.response))
+        return Dense(*(tuple(_first(side) for side in sides) for sides in (self.jacobian, self.response)))
 
     def dense(self) -> Dense:
         return self
@@ -65,15 +65,28 @@ class Points:
     """Rows along directions at points of two bodies, or of one.
 
     Attributes:
-      directions: in which side B moves against side A; of the only side with its sign.
-      angular: for each side, its sign times (arm x direction); none where nothing couples to rotation.
-      packed_inertia: for each side, the entries of its inverse inertia (turn, entry, constraint, world) in one array, of
-        which loops have a kernel each.
+      packed: (..., row, component, column, world) the directions in which side B moves against side A, of the only side
+        with its sign; then for each side its sign times (arm x direction), unless nothing couples to rotation. In one
+        array, since loops have kernels for each.
+      packed_inertia: for each side, the entries of its inverse inertia (turn, entry, constraint, world), likewise.
     """
 
-    directions: Array
-    angular: tuple[Array, ...]
+    packed: Array
     packed_inertia: tuple[Array, ...]
+
+    @property
+    def directions(self) -> Array:
+        """(..., row, 3, column, world)."""
+        return self._parts[0]
+
+    @property
+    def angular(self) -> tuple[Array, ...]:
+        """For each side (..., row, 3, column, world); none where nothing couples to rotation."""
+        return tuple(self._parts[1:])
+
+    @property
+    def _parts(self) -> list[Array]:
+        return _vectors(self.packed, -3)
 
     @property
     def inertia(self) -> tuple[InverseInertia, ...]:
@@ -83,7 +96,7 @@ class Points:
     @property
     def like(self) -> Array:
         """A finite array (..., row, column, world)."""
-        return self.directions[..., 0, :, :]
+        return self.packed[..., 0, :, :]
 
     @property
     def _signs(self) -> tuple[float, ...]:
@@ -102,13 +115,12 @@ class Points:
     def changes(self, impulse: Array, together: int) -> list[Array]:
         """As `Dense.changes`."""
         # Stored, since every component of a change needs all of them, in different ways.
-        like = self.directions[0, :, ::together]
-        force = store(_sum(self.directions, impulse, together), like)
+        like = self.packed[0, :, ::together]
+        force, *torques = _vectors(store(_sum(self.packed, impulse, together), like), 0)
         linear = [force * (sign * side.inverse_mass) for sign, side in zip(self._signs, self.inertia, strict=True)]
-        if not self.angular:
+        if not torques:
             return linear
-        torques = [unstack(store(_sum(side, impulse, together), like), 0) for side in self.angular]
-        angular = [side.solve(Vec3(*torque)) for side, torque in zip(self.inertia, torques, strict=True)]
+        angular = [side.solve(Vec3(*unstack(torque, 0))) for side, torque in zip(self.inertia, torques, strict=True)]
         return [jnp.concatenate([moved, jnp.stack(turned)]) for moved, turned in zip(linear, angular, strict=True)]
 
     def linear(self) -> tuple[Array, ...]:
@@ -124,12 +136,11 @@ class Points:
 
     def stored(self) -> Points:
         """The same, computed once."""
-        directions, angular = compute_once((self.directions, self.angular), self.like)
-        return Points(directions, angular, self.packed_inertia)
+        return Points(compute_once(self.packed, self.like), self.packed_inertia)
 
     def first_row(self) -> Points:
         """As `Dense.first_row`."""
-        return Points(self.directions[:, :1], tuple(side[:, :1] for side in self.angular), self.packed_inertia)
+        return Points(_first(self.packed), self.packed_inertia)
 
     def dense(self) -> Dense:
         """The same rows with all entries. Stored: each product, and each cotangent, would compute them again."""
@@ -150,11 +161,52 @@ class Points:
 
     def _of_columns(self, values: Array) -> Array:
         """(..., 1, 1, column, world) from (..., constraint, world)."""
-        together = self.directions.shape[-2] // values.shape[-2]
+        together = self.packed.shape[-2] // values.shape[-2]
         return jnp.repeat(values, together, axis=-2)[..., None, None, :, :]
 
 
-RowMatrix = Dense | Points
+@pytree
+class FirstRow:
+    """The first row of each constraint of other rows, taken out where it is used: a copy for all turns takes longer."""
+
+    whole: RowMatrix
+
+    @property
+    def like(self) -> Array:
+        """A finite array (..., row, column, world)."""
+        return self.whole.first_row().like
+
+    def rates(self, velocities: Sequence[Array]) -> Array:
+        """As `Dense.rates`."""
+        return self.whole.first_row().rates(velocities)
+
+    def changes(self, impulse: Array, together: int) -> list[Array]:
+        """As `Dense.changes`."""
+        return self.whole.first_row().changes(impulse, together)
+
+    def linear_responses(self) -> tuple[Array, ...]:
+        """As `Dense.linear_responses`."""
+        return self.whole.first_row().linear_responses()
+
+    def first_row(self) -> FirstRow:
+        return self
+
+    def dense(self) -> Dense:
+        """The same rows with all entries."""
+        return self.whole.first_row().dense()
+
+
+RowMatrix = Dense | Points | FirstRow
+
+
+def _vectors(packed: Array, axis: int) -> list[Array]:
+    """Triples of components."""
+    axis %= packed.ndim
+    return list(jax.lax.split(packed, (3,) * (packed.shape[axis] // 3), axis=axis))
+
+
+def _first(rows: Array) -> Array:
+    return rows[..., :1, :, :, :]
 
 
 def _along(rows: Array, velocity: Array) -> Array:

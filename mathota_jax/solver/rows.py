@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
@@ -21,6 +22,7 @@ from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import RowMatrix
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
+from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.settle import store
 from mathota_jax.spatial.spread import spread
@@ -149,6 +151,23 @@ def row_velocity(group: Rows, velocity: Array) -> Array:
 def first_row_velocity(group: Rows, velocity: Array) -> Array:
     """``J v`` of the first row of each constraint, (turn, 1, column, world)."""
     return matrix_velocity(group.table, group.matrix.first_row(), group.places, velocity)
+
+
+def map_turns(function: Callable[[Rows, Any], Any], group: Rows, tree: Any) -> Any:
+    """`function` of the rows of turns and of arrays (turn, ...), whose results have that axis too.
+
+    Of the turns of a traced table that hold a constraint, chunk by chunk, where each turn holds one; it is 0 in the others.
+    """
+    places = group.places
+    if places is None or places.turns is None or group.table.constraint_count > 1:
+        return function(group, tree)
+
+    def of_chunk(chunk: tuple[Any, ...]) -> Any:
+        matrix, bias, law, blocks, values = chunk
+        table = dataclasses.replace(group.table, turn_count=bias.shape[0])
+        return function(Rows(matrix, bias, law, table, Places(blocks, None)), values)
+
+    return map_filled(of_chunk, (group.matrix, group.bias, group.law, places.blocks, tree), places.turns)
 
 
 def matrix_velocity(table: Table | TracedTable, matrix: RowMatrix, places: Places | None, velocity: Array) -> Array:

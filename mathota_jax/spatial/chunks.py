@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.spatial import counter
+
 FEWEST, MOST = 5, 12
 """Rows computed at a time: few enough to leave out most of an empty table, many enough to keep a single world busy."""
 
@@ -52,19 +54,14 @@ def map_filled(function: Callable[[Any], Any], tree: Any, filled: Array) -> Any:
 def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used: Array) -> Any:
     """`function(chunk, *constants)` of the chunks in use, stacked, and 0 elsewhere."""
 
-    def body(k: Array, results: Any) -> Any:
-        chunk = jax.tree.map(
-            lambda x: lax.dynamic_index_in_dim(x, k, 0, keepdims=False, allow_negative_indices=False), chunks
-        )
-        return jax.tree.map(
-            lambda all_, x: lax.dynamic_update_index_in_dim(all_, x, k, 0, allow_negative_indices=False),
-            results,
-            function(chunk, *constants),
-        )
+    def body(_: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        k, results = carry
+        found = function(counter.row(chunks, k), *constants)
+        return counter.following(k), jax.tree.map(lambda all_, x: counter.put(all_, x, k), results, found)
 
     chunk = jax.tree.map(lambda x: x[0], chunks)
     zeros = _zeros(function, constants, chunk, jax.tree.leaves(chunks)[0].shape[:1])
-    return lax.fori_loop(0, used, body, zeros)
+    return lax.fori_loop(0, used, body, (counter.start(), zeros))[1]
 
 
 @_map_chunks.defjvp
