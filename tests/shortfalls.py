@@ -56,10 +56,6 @@ SHORTFALLS: dict[str, str] = {
     + "joint gap 5.6e-3 of the arm, gate 5e-3",
     "tests/physics/test_joints.py::test_hinge_limits_hold[float64-1.0]": SWEEPS
     + "joint gap 5.6e-3 of the arm, gate 5e-3",
-    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[default]": "the Jacobian is that of the "
-    "middle of the step, the inertia that of its start: where it is 5000 times less about one axis, a deviation of 1e-16 "
-    "out of the plane grows sixfold a step, and the energy without bound, also with 40 sweeps; 13 times less is stable",
-    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[converged]": "as with the default solver",
     "tests/envs/test_ball_balance.py::test_gimbal_holds_the_plate": SWEEPS
     + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
     **{

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia, moving, of_all_bodies, vector
+from mathota_jax.bodies import Bodies, Inertia, merge, moving, vector
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import (
     compact,
@@ -66,7 +66,7 @@ def constrain(
     blocks: Bodies,
     inertia: Inertia,
     free: tuple[Vec3, Vec3],
-    carried: Vec3 | None,
+    halfway: Bodies | None,
     gravity: Vec3,
     action: Array,
 ) -> Problem:
@@ -77,7 +77,7 @@ def constrain(
       bodies, blocks: all bodies and the moving ones at the start of the step.
       inertia: with which the moving bodies respond to impulses.
       free: their velocities at the end of the step without constraints.
-      carried: angular velocities at the middle of the step with the momentum of the start; None if they are the same.
+      halfway: the moving ones at the middle of the step without constraints, if they were followed that far.
       gravity: components (1, world).
       action: (motor, world).
     """
@@ -86,12 +86,12 @@ def constrain(
     joints, held, responses, tables, errors = None, None, None, (), ()
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
-        halfway = joint_rows.moved_by(bodies, 0.5 * model.dt)
-        if carried is not None:
-            halfway = halfway._replace(angular_velocity=of_all_bodies(scene, carried))
-        middle = joint_rows.joint_rows(model, halfway)
+        there = joint_rows.moved_by(bodies, 0.5 * model.dt)
+        if halfway is not None:
+            there = merge(scene, bodies, halfway)
+        middle = joint_rows.joint_rows(model, there)
         if mechanism_layout.layout(scene) is not None:
-            held = mechanism.links(scene, middle, moving(scene, halfway).position, inertia)
+            held = mechanism.links(scene, middle, moving(scene, there).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
         rows_of = substep_rows.joint_rows if small_steps else joint.velocity_rows
