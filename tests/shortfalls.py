@@ -34,12 +34,6 @@ SHORTFALLS: dict[str, str] = {
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
-        f"tests/stability/test_scale.py::test_penetration_scales_with_size[float32-cards-{kind}]": "two cards that lean on "
-        f"each other fall at scales 1e-4 and 1e-3 (1e-16 and 1e-13 kg), overlapping {times} times as much; else, and in "
-        "float64 at all scales, they stand with the same overlap to 1e-4. Not explained yet"
-        for kind, times in (("dt unchanged, gravity scaled", 40), ("gravity unchanged, dt scaled", 24))
-    },
-    **{
         f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "finite, but two boxes "
         f"with a pendulum on the upper, at rest, gain {gain} times their energy in steps of 100 s, 640 times in 10 s "
         "and 4 % in 0.1 s (float64), gate 1 %; none in steps of 1e-12 to 1e-3 s and of 1 s"
