@@ -8,11 +8,6 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    **{
-        f"tests/physics/test_soft_step.py::test_slab_that_sticks_does_not_creep[{precision}]": "no creep, but a start from "
-        "nothing: at 40 degrees the slab slides 0.144 mm in the first step and no further in 3 s, gate 0.1 mm"
-        for precision in ("float32", "float64")
-    },
     "tests/physics/test_soft_step.py::test_boxes_on_one_point_separate[0.0]": "boxes that coincide exactly leave in one "
     "line, each by the push-out velocity from the next: the last at 18 m/s, gate 4.5; 1e-4 apart they keep to 2.95 m/s",
     "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
@@ -39,9 +34,6 @@ SHORTFALLS: dict[str, str] = {
         "and 4 % in 0.1 s (float64), gate 1 %; none in steps of 1e-12 to 1e-3 s and of 1 s"
         for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
     },
-    "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
-    "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
-    "its centre ends up to 77 mm in the ground",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/gradients/test_bystanders.py::test_stick_and_slip[float64]": SWEEPS
