@@ -13,6 +13,7 @@ from mathota_jax.bodies import Bodies, place
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import compact, contact, joint_layout, loops
 from mathota_jax.constraints.assembly import collect
+from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -81,13 +82,23 @@ def _mean_forces(scene: Scene, problem: Problem, impulses: tuple[Array, ...], ti
     found, count = {}, len(problem.joint_rows)
     if problem.joints is not None:
         tables = [rows.table for rows in problem.joint_rows]
-        values = [impulse[:, 0] / time for impulse in impulses[:count]]
+        values = [
+            _original(impulse[:, 0], decoupling) / time
+            for impulse, decoupling in zip(impulses[:count], problem.of_joint_rows, strict=True)
+        ]
         found["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
     if problem.contacts is not None:
         found["contact_force"] = contact.slot_force(
             problem.contact_rows, list(impulses[count:]), scene.slot_count, time
         )
     return found
+
+
+def _original(impulse: Array, decoupling: Decoupling | None) -> Array:
+    """Impulses (turn, column, world) of the rows as the joints have them."""
+    if decoupling is None:
+        return impulse
+    return decoupling.original_impulses(impulse.reshape(-1, impulse.shape[-1])).reshape(impulse.shape)
 
 
 def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> Array:

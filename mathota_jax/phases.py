@@ -192,7 +192,9 @@ def correct_positions(
         bounded = () if problem.responses is None else bounded_slots(scene)
         rows += [
             joint.position_rows(scene, group.table, problem.joints, error, inertia, bounded)
-            for group in problem.joint_rows
+            if how is None
+            else joint.decoupled_position_rows(scene, group, how, problem.joints, error)
+            for group, how in zip(problem.joint_rows, problem.of_joint_rows, strict=True)
         ]
         if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
             back = mechanism_rows.leave_stops(

@@ -38,12 +38,9 @@ SHORTFALLS: dict[str, str] = {
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/gradients/test_bystanders.py::test_stick_and_slip[float64]": SWEEPS
     + "dv/dF and dv/dmu of a slipping box are 0.41 % off, gate 0.1 %",
-    "tests/physics/test_joints.py::test_hinge_limits_hold[float32-1.0]": SWEEPS
-    + "joint gap 5.6e-3 of the arm, gate 5e-3",
-    "tests/physics/test_joints.py::test_hinge_limits_hold[float64-1.0]": SWEEPS
-    + "joint gap 5.6e-3 of the arm, gate 5e-3",
     "tests/envs/test_ball_balance.py::test_gimbal_holds_the_plate": SWEEPS
-    + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
+    + "the plate turns 1.12e-4 rad out of its gimbal, gate 1e-4: each joint is solved exactly, but an error of the plate is "
+    "taken by the lighter frame, and then by its joint; 5.5e-6 with 50 sweeps over positions in place of 3",
     **{
         f"tests/unit/test_state.py::test_nothing_assumes_an_up_axis[{axis}]": "the order of the sweeps follows the axes of "
         "the tangents: 3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6"

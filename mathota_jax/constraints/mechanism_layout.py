@@ -161,16 +161,16 @@ def bounded_slots(scene: Scene) -> tuple[int, ...]:
 
 
 def _held_joints(scene: Scene) -> tuple[dict[int, _Slots], dict[int, tuple[int, ...]]]:
-    """Of each joint that holds anything: its slots as in `_held_slots`, and its velocity blocks or `GROUND`."""
+    """Of each joint that holds anything: its slots as in `held_slots`, and its velocity blocks or `GROUND`."""
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
     groups = joint_groups(scene)
-    held = {joint: _held_slots(group, place) for group in groups for place, joint in enumerate(group.joints)}
+    held = {joint: held_slots(group, place) for group in groups for place, joint in enumerate(group.joints)}
     held = {joint: slots for joint, slots in held.items() if any(slots)}
     bodies = {joint: (scene.joints[joint].parent, scene.joints[joint].child) for joint in held}
     return held, {joint: tuple(block_of.get(body, GROUND) for body in pair) for joint, pair in bodies.items()}
 
 
-def _held_slots(group: JointGroup, place: int) -> _Slots:
+def held_slots(group: JointGroup, place: int) -> _Slots:
     """Slots of the rows of a joint that hold translations, and rotations, whatever happens."""
     kind, row = group.kind, group.kind.fixed_row_count
     rows: tuple[list[int], list[int]] = ([*range(kind.fixed_translations)], [*range(kind.fixed_translations, row)])
