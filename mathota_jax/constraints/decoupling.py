@@ -25,7 +25,7 @@ from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.mechanism_layout import held_slots, layout
 from mathota_jax.scene import Scene
 from mathota_jax.solver.table import EMPTY, Table
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_slices
@@ -60,7 +60,13 @@ class Decoupling:
 
     def sides(self, sides: Sequence[Side]) -> list[Side]:
         """New Jacobians or responses, components (turn * column, world)."""
-        return [jax.tree.map(self.rows, side) for side in sides]
+        leaves, structure = jax.tree.flatten(list(sides))
+        old = self.layout.stacked(leaves)
+        # All components in one kernel.
+        new = add_slices(self.matrix * old[:, None], 2)
+        return jax.tree.unflatten(
+            structure, [self.layout.by_place(part) for part in unstack(compute_once(new, new), 0)]
+        )
 
     def impulses(self, values: Array) -> Array:
         """Impulses (turn * column, world) of the new rows from those of the old ones."""
@@ -120,6 +126,12 @@ class RowLayout:
             values = jnp.concatenate([values, jnp.zeros_like(values[:1])])
         return take(values, self.places.reshape(-1)).reshape(*self.shape, values.shape[-1])
 
+    def stacked(self, values: Sequence[Array]) -> Array:
+        """(value, row, joint, world) from several."""
+        parts = [self.by_joint(part) for part in values]
+        worlds = max(part.shape[-1] for part in parts)
+        return jnp.stack([jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in parts])
+
     def by_place(self, values: Array) -> Array:
         """The other way round; any value for padding."""
         back = np.zeros(len(self.table.order) + 1, np.int32)
@@ -153,27 +165,20 @@ def decouple(scene: Scene, table: Table, jacobians: Sequence[Side], responses: S
     found = row_layout(scene, table)
     count, holding = found.shape[0], found.holding
     index = np.arange(count)[:, None]
-
-    def packed(sides: Sequence[Side]) -> Array:
-        parts = [found.by_joint(part) for side in sides for part in jax.tree.leaves(side)]
-        worlds = max(part.shape[-1] for part in parts)
-        return jnp.stack([jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in parts])
-
-    jacobian, response = packed(jacobians), packed(responses)
-    jacobian, response = jax.lax.stop_gradient((jacobian, response))
-    products = compute_once(add_slices(jacobian[:, :, None] * response[:, None], 0), jacobian)
-    matrix = jnp.broadcast_to(jnp.eye(count, dtype=products.dtype)[:, :, None, None], products.shape)
+    jacobian, response = (
+        jax.lax.stop_gradient(found.stacked(jax.tree.leaves(list(sides)))) for sides in (jacobians, responses)
+    )
+    products = add_slices(jacobian[:, :, None] * response[:, None], 0)
+    identity = jnp.broadcast_to(jnp.eye(count, dtype=products.dtype)[:, :, None, None], products.shape)
+    # What is done to the products is done to the rows beside them.
+    both = compute_once(jnp.concatenate([products, identity], axis=1), products)
     shares = []
     for row in found.pivots:
-        own = jnp.where(holding[row][:, None], products[row, row], 1.0)
+        own = jnp.where(holding[row][:, None], both[row, row], 1.0)
         taken = holding[row] & (index != row) & ((index > row) | ~holding)
-        share = jnp.where(
-            taken[:, :, None], safe_divide(products[:, row], jnp.broadcast_to(own, products[:, row].shape)), 0.0
-        )
-        share = compute_once(share, own)
-        products, matrix = compute_once(
-            (products - share[:, None] * products[row], matrix - share[:, None] * matrix[row]), own
-        )
+        share = safe_divide(both[:, row], jnp.broadcast_to(own, both[:, row].shape))
+        share = compute_once(jnp.where(taken[:, :, None], share, 0.0), own)
+        both = compute_once(both - share[:, None] * both[row], own)
         shares.append(share)
-    mass = found.by_place(jnp.stack([products[row, row] for row in range(count)]))
-    return Decoupling(matrix, tuple(shares), mass, found)
+    mass = found.by_place(jnp.stack([both[row, row] for row in range(count)]))
+    return Decoupling(both[:, count:], tuple(shares), mass, found)
