@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -144,6 +146,28 @@ def of_all_bodies(scene: Scene, blocks: Vec3) -> Vec3:
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
     index = [block_of.get(body, len(block_of)) for body in range(scene.body_count)]
     return take(blocks.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])), index)
+
+
+def merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:
+    """All bodies, the moving ones at their new place."""
+    return jax.tree.map(lambda old, new: place(scene, old[:, None], [new])[:, 0], bodies, moved)
+
+
+def place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:
+    """(body, component, world) array: static bodies from `old`, the others from components of shape (moving, world)."""
+    worlds = max(old.shape[-1], *(component.shape[-1] for component in components))
+    moving_count = len(scene.dynamic_bodies)
+    new = jnp.stack([jnp.broadcast_to(component, (moving_count, worlds)) for component in components], axis=1)
+    # Runs of bodies that are all moving or all static; a concatenation of slices is cheaper than a gather.
+    parts, start = [], 0
+    for is_static, run in itertools.groupby(range(scene.body_count), key=lambda body: scene.static[body]):
+        bodies = list(run)
+        if is_static:
+            parts.append(jnp.broadcast_to(take(old, bodies), (len(bodies), *new.shape[1:])))
+        else:
+            parts.append(new[start : start + len(bodies)])
+            start += len(bodies)
+    return jnp.concatenate(parts)
 
 
 def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inertia:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.bodies import moving, moving_inertia, unpack
+from mathota_jax.bodies import merge, moving, moving_inertia, unpack
 from mathota_jax.constraints import collisions, contact, joint_layout
 from mathota_jax.constraints.lever import levers
 from mathota_jax.constraints.problem import constrain, starting_impulses
@@ -17,7 +17,7 @@ from mathota_jax.dynamics.flight import flight, with_static
 from mathota_jax.dynamics.impact_times import FirstImpact, first_impact
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.model import Model
-from mathota_jax.outcome import forces, merge, new_state
+from mathota_jax.outcome import forces, new_state
 from mathota_jax.phases import correct_positions, external, free_velocities, gravity, solve_rows
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import in_every_world
@@ -101,7 +101,7 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     )
     solved, impulses, failed = solve_rows(scene, problem, packed, start)
     lever, beyond = levers(scene, left, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
-    moved, displacement = advance(blocks, inertia, inertia, free, torque, decay, solved, lever, left, beyond)
+    moved, displacement = advance(blocks, inertia, inertia, None, free, torque, decay, solved, lever, left, beyond)
     path = flight(blocks, inertia, free, torque, decay, solved, left)
     quiet = FirstImpact(left, jnp.zeros_like(split))
     impact = lax.cond(

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
-from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies
+from mathota_jax.bodies import Bodies, place
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints import compact, contact, joint_layout, loops
 from mathota_jax.constraints.assembly import collect
+from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.state import EndForces, Flag, State
 
@@ -36,7 +33,7 @@ def new_state(scene: Scene, state: State, moved: Bodies, kept: dict[str, Array],
     """
     moved = compute_once(moved, moved.position.x)
     position, orientation, velocity, angular_velocity = (
-        _place(scene, getattr(state, name), getattr(moved, name))
+        place(scene, getattr(state, name), getattr(moved, name))
         for name in ("position", "orientation", "velocity", "angular_velocity")
     )
     finite = [jnp.isfinite(value).all((0, 1)) for value in (position, orientation, velocity, angular_velocity)]
@@ -85,13 +82,23 @@ def _mean_forces(scene: Scene, problem: Problem, impulses: tuple[Array, ...], ti
     found, count = {}, len(problem.joint_rows)
     if problem.joints is not None:
         tables = [rows.table for rows in problem.joint_rows]
-        values = [impulse[:, 0] / time for impulse in impulses[:count]]
+        values = [
+            _original(impulse[:, 0], decoupling) / time
+            for impulse, decoupling in zip(impulses[:count], problem.of_joint_rows, strict=True)
+        ]
         found["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
     if problem.contacts is not None:
         found["contact_force"] = contact.slot_force(
             problem.contact_rows, list(impulses[count:]), scene.slot_count, time
         )
     return found
+
+
+def _original(impulse: Array, decoupling: Decoupling | None) -> Array:
+    """Impulses (turn, column, world) of the rows as the joints have them."""
+    if decoupling is None:
+        return impulse
+    return decoupling.original_impulses(impulse.reshape(-1, impulse.shape[-1])).reshape(impulse.shape)
 
 
 def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> Array:
@@ -103,25 +110,3 @@ def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> 
     if close is not None:
         flags = flags | jnp.where(close.overflow, int(Flag.CONTACT_OVERFLOW), 0)
     return flags
-
-
-def merge(scene: Scene, bodies: Bodies, moved: Bodies) -> Bodies:
-    """All bodies, the moving ones at their new place."""
-    return jax.tree.map(lambda old, new: _place(scene, old[:, None], [new])[:, 0], bodies, moved)
-
-
-def _place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:
-    """(body, component, world) array: static bodies from `old`, the others from components of shape (moving, world)."""
-    worlds = max(old.shape[-1], *(component.shape[-1] for component in components))
-    moving_count = len(scene.dynamic_bodies)
-    new = jnp.stack([jnp.broadcast_to(component, (moving_count, worlds)) for component in components], axis=1)
-    # Runs of bodies that are all moving or all static; a concatenation of slices is cheaper than a gather.
-    parts, start = [], 0
-    for is_static, run in itertools.groupby(range(scene.body_count), key=lambda body: scene.static[body]):
-        bodies = list(run)
-        if is_static:
-            parts.append(jnp.broadcast_to(take(old, bodies), (len(bodies), *new.shape[1:])))
-        else:
-            parts.append(new[start : start + len(bodies)])
-            start += len(bodies)
-    return jnp.concatenate(parts)

@@ -9,15 +9,24 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.bodies import Bodies, Inertia, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
-from mathota_jax.constraints import contact, graph, joint, joint_rows, mechanism, mechanism_rows, motor, rebound_limit
+from mathota_jax.bodies import Bodies, Inertia, merge, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
+from mathota_jax.constraints import (
+    contact,
+    graph,
+    joint,
+    joint_layout,
+    joint_rows,
+    mechanism,
+    mechanism_rows,
+    motor,
+    rebound_limit,
+)
 from mathota_jax.constraints.mechanism_layout import bounded_slots, covers, covers_with_bounds, layout
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.dynamics import events, sleep
-from mathota_jax.dynamics.free_motion import carried_velocity, free_velocity
+from mathota_jax.dynamics.free_motion import drift, free_velocity
 from mathota_jax.dynamics.integrate import displace
 from mathota_jax.model import Model
-from mathota_jax.outcome import merge
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.rows import Rows, add_impulses
@@ -36,20 +45,23 @@ def external(model: Model, state: State, bodies: Bodies, action: Array) -> tuple
     return take((force, torque), model.scene.dynamic_bodies)
 
 
-def acting_inertia(model: Model, blocks: Bodies, inertia: Inertia) -> tuple[Inertia, Vec3 | None]:
-    """Inertia with which bodies respond to impulses: with mechanisms that of mid-step; see `carried_velocity`."""
-    if layout(model.scene) is None or inertia.rotation is None:
+def acting_inertia(model: Model, blocks: Bodies, inertia: Inertia) -> tuple[Inertia, Bodies | None]:
+    """Inertia with which bodies respond to impulses, and where they do so if it is not where the step starts.
+
+    Joints act at the middle of the step, see `drift`; all else at its start.
+    """
+    options = model.scene.options
+    if not joint_layout.joint_row_count(model.scene) or inertia.rotation is None or options.solver == "soft_step":
         return inertia, None
-    blocks = store_cotangents(blocks)
-    middle = inertia.at(joint_rows.moved_by(blocks, 0.5 * model.dt).orientation)
-    return compute_once((middle, carried_velocity(blocks, inertia, middle)), blocks.position.x)
+    return compute_once(drift(store_cotangents(blocks), inertia, 0.5 * model.dt), blocks.position.x)
 
 
 def free_velocities(
-    model: Model, blocks: Bodies, inertia: Inertia, carried: Vec3 | None, force: Vec3, torque: Vec3
+    model: Model, blocks: Bodies, inertia: Inertia, halfway: Bodies | None, force: Vec3, torque: Vec3
 ) -> tuple[tuple[Vec3, Vec3], float | Array]:
     """Phase 4: velocities at the end of the step without constraints; also the decay of the angular momentum."""
     options, dt = model.scene.options, model.dt
+    carried = None if halfway is None else halfway.angular_velocity
     linear, angular = free_velocity(blocks, inertia, carried, gravity(model), force, torque, dt)
     if options.linear_damping:
         linear = linear * jnp.maximum(1.0 - options.linear_damping * dt, 0.0)
@@ -180,7 +192,9 @@ def correct_positions(
         bounded = () if problem.responses is None else bounded_slots(scene)
         rows += [
             joint.position_rows(scene, group.table, problem.joints, error, inertia, bounded)
-            for group in problem.joint_rows
+            if how is None
+            else joint.decoupled_position_rows(scene, group, how, problem.joints, error)
+            for group, how in zip(problem.joint_rows, problem.of_joint_rows, strict=True)
         ]
         if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
             back = mechanism_rows.leave_stops(

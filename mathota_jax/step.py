@@ -152,10 +152,10 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
         return new_state(scene, state, moving(scene, bodies), {})
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
-    acting, carried = acting_inertia(model, blocks, inertia)
+    acting, halfway = acting_inertia(model, blocks, inertia)
     force, torque = external(model, state, bodies, action)
-    free, decay = compute_once(free_velocities(model, blocks, acting, carried, force, torque), state.position)
-    problem = constrain(model, state, bodies, blocks, acting, free, carried, gravity(model), action)
+    free, decay = compute_once(free_velocities(model, blocks, acting, halfway, force, torque), state.position)
+    problem = constrain(model, state, bodies, blocks, acting, free, halfway, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
     if known is not None:
         start, change = known_impulses(model, problem, known), None
@@ -167,7 +167,9 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
     else:
         solved, impulses, failed = solve_rows(scene, problem, packed, start, change, known is not None)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
-    moved, displacement = advance(blocks, inertia, acting, free, torque, decay, solved, lever, model.dt, beyond, gained)
+    moved, displacement = advance(
+        blocks, inertia, acting, halfway, free, torque, decay, solved, lever, model.dt, beyond, gained
+    )
     moved, displacement = compute_once((moved, displacement), state.position)
     if scene.options.solver != "soft_step":
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)

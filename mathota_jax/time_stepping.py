@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.model import Model
-from mathota_jax.spatial.quaternion import Quaternion, exponential, logarithm, multiply, normalize
+from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize, turn_between
 from mathota_jax.spatial.settle import settle
 from mathota_jax.state import Flag, State
 from mathota_jax.step import step
@@ -148,8 +148,7 @@ def interpolate(previous: State, current: State, alpha: Any) -> State:
     alpha = jnp.asarray(alpha, current.position.dtype)
     start = Quaternion(*jnp.moveaxis(previous.orientation, -1, 0))
     end = Quaternion(*jnp.moveaxis(current.orientation, -1, 0))
-    turn = multiply(end, Quaternion(start.w, -start.x, -start.y, -start.z))
-    turned = normalize(multiply(exponential(logarithm(turn) * alpha), start))
+    turned = normalize(multiply(exponential(turn_between(start, end) * alpha), start))
     return dataclasses.replace(
         current,
         position=previous.position + alpha * (current.position - previous.position),

@@ -8,11 +8,6 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    **{
-        f"tests/physics/test_soft_step.py::test_slab_that_sticks_does_not_creep[{precision}]": "no creep, but a start from "
-        "nothing: at 40 degrees the slab slides 0.144 mm in the first step and no further in 3 s, gate 0.1 mm"
-        for precision in ("float32", "float64")
-    },
     "tests/physics/test_soft_step.py::test_boxes_on_one_point_separate[0.0]": "boxes that coincide exactly leave in one "
     "line, each by the push-out velocity from the next: the last at 18 m/s, gate 4.5; 1e-4 apart they keep to 2.95 m/s",
     "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
@@ -23,7 +18,9 @@ SHORTFALLS: dict[str, str] = {
     **{
         f"tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[{precision}-2.0]": "after three "
         "exact bounces the rest of a step of 2 s is an ordinary step: in one of ten it ends 0.1 to 0.3 m above the start of "
-        "0.5 m, gate 0"
+        "0.5 m, gate 0. A ball that leaves the plane is stopped there for the end of the step with half the step as lever, "
+        "which lifts it (a lever that ends it on the plane gains nothing); and the ball 5 m beside it, extrapolated along "
+        "the normal between them, pushes it 0.4 m into the plane (so measured with that lever)"
         for precision in ("float32", "float64")
     },
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
@@ -34,34 +31,21 @@ SHORTFALLS: dict[str, str] = {
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
-        f"tests/stability/test_scale.py::test_penetration_scales_with_size[float32-cards-{kind}]": "two cards that lean on "
-        f"each other fall at scales 1e-4 and 1e-3 (1e-16 and 1e-13 kg), overlapping {times} times as much; else, and in "
-        "float64 at all scales, they stand with the same overlap to 1e-4. Not explained yet"
-        for kind, times in (("dt unchanged, gravity scaled", 40), ("gravity unchanged, dt scaled", 24))
-    },
-    **{
         f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "finite, but two boxes "
         f"with a pendulum on the upper, at rest, gain {gain} times their energy in steps of 100 s, 640 times in 10 s "
         "and 4 % in 0.1 s (float64), gate 1 %; none in steps of 1e-12 to 1e-3 s and of 1 s"
         for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
     },
-    "tests/physics/test_fast_bodies.py::test_a_spinning_stick_does_not_fall_through_the_ground": "a stick that spins "
-    "while it touches sinks by up to a tenth of its inner radius a step: in 51 of 1000 runs "
-    "its centre ends up to 77 mm in the ground",
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
     + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
     "tests/gradients/test_bystanders.py::test_stick_and_slip[float64]": SWEEPS
     + "dv/dF and dv/dmu of a slipping box are 0.41 % off, gate 0.1 %",
-    "tests/physics/test_joints.py::test_hinge_limits_hold[float32-1.0]": SWEEPS
-    + "joint gap 5.6e-3 of the arm, gate 5e-3",
-    "tests/physics/test_joints.py::test_hinge_limits_hold[float64-1.0]": SWEEPS
-    + "joint gap 5.6e-3 of the arm, gate 5e-3",
-    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[default]": "the Jacobian is that of the "
-    "middle of the step, the inertia that of its start: where it is 5000 times less about one axis, a deviation of 1e-16 "
-    "out of the plane grows sixfold a step, and the energy without bound, also with 40 sweeps; 13 times less is stable",
-    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[converged]": "as with the default solver",
+    "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[sweeps]": "two joints left to 10 sweeps (as "
+    "beside contacts), rods with 5000 times less inertia about one axis: not finite, with 40 sweeps either; 200 hold "
+    "(energy never gained), one rod alone holds with 10",
     "tests/envs/test_ball_balance.py::test_gimbal_holds_the_plate": SWEEPS
-    + "the plate turns 1.27e-4 rad out of its gimbal, gate 1e-4, since damping is of second order and takes less energy",
+    + "the plate turns 1.12e-4 rad out of its gimbal, gate 1e-4: each joint is solved exactly, but an error of the plate is "
+    "taken by the lighter frame, and then by its joint; 5.5e-6 with 50 sweeps over positions in place of 3",
     **{
         f"tests/unit/test_state.py::test_nothing_assumes_an_up_axis[{axis}]": "the order of the sweeps follows the axes of "
         "the tangents: 3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from jax import Array
 
 from mathota_jax.bodies import Inertia
 from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sides, respond, select, select_blocks
+from mathota_jax.constraints.decoupling import Decoupling, decouple
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
@@ -51,7 +53,19 @@ class JointMotion(NamedTuple):
 
 def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
     """Rows of one table for the velocity solver."""
+    return decoupled_rows(scene, table, model, motion, False)[0]
+
+
+def decoupled_rows(
+    scene: Scene, table: Table, model: Model, motion: JointMotion, decouples: bool = True
+) -> tuple[Rows, Decoupling | None]:
+    """The same, if wished with rows that are independent within each joint; also how they were made so."""
     jacobians, responses, mass = _sides(scene, table, motion.middle, motion.inertia)
+    decoupling = None
+    if decouples:
+        decoupling = decouple(scene, table, jacobians, responses)
+        mass = decoupling.mass
+        jacobians, responses = decoupling.sides(jacobians), decoupling.sides(responses)
     slots = np.maximum(table.order, 0)
     laws, curved, angular = (values[slots] for values in (motion.start.laws, motion.start.curved, motion.start.angular))
     error, rate, coefficients = select(table, (motion.start.error, motion.start.rate, motion.coefficients))
@@ -67,6 +81,8 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
 
     curvature = select(table, motion.middle.rate - motion.start.rate)
     bias = of_each("bias") + jnp.where(curved[:, None], curvature, 0.0)
+    if decoupling is not None:
+        bias = decoupling.rows(bias)
     worlds = max(jnp.shape(value)[-1] for value in (mass, error, *coefficients.values()))
     # Where a soft row does nothing it is void: an infinite softness, expressed by a zero effective mass.
     works = of_each("works")
@@ -79,7 +95,7 @@ def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion)
         lower=_pack_bound(table, of_each("lower"), worlds),
         upper=_pack_bound(table, of_each("upper"), worlds),
     )
-    return _pack(table, jacobians, responses, bias, law, worlds)
+    return _pack(table, jacobians, responses, bias, law, worlds), decoupling
 
 
 def _with_trees(scene: Scene, slots: np.ndarray, mass: Array, responses: Responses) -> Array:
@@ -115,11 +131,31 @@ def position_rows(
 ) -> Rows:
     """Rows of one table for the position correction, void in slots `left_out`; `error` (slot, world) after the step."""
     jacobians, responses, mass = _sides(scene, table, joints, inertia)
+    worlds = max(mass.shape[-1], error.shape[-1])
+    bias, law = _position_laws(scene, table, joints, select(table, error), mass, worlds, left_out)
+    return _pack(table, jacobians, responses, bias, law, worlds)
+
+
+def decoupled_position_rows(scene: Scene, rows: Rows, decoupling: Decoupling, joints: JointRows, error: Array) -> Rows:
+    """The same from the rows of the velocity solver, where they were decoupled."""
+    worlds = max(rows.bias.shape[-1], error.shape[-1])
+    bias, law = _position_laws(scene, rows.table, joints, select(rows.table, error), decoupling.mass, worlds)
+    return dataclasses.replace(rows, bias=pack_scalars(rows.table, [decoupling.rows(bias)], worlds), law=law)
+
+
+def _position_laws(
+    scene: Scene,
+    table: Table,
+    joints: JointRows,
+    error: Array,
+    mass: Array,
+    worlds: int,
+    left_out: tuple[int, ...] = (),
+) -> tuple[Array, Bounded]:
+    """Bias and law of position rows; `error` and `mass` (turn * column, world)."""
     slots = np.maximum(table.order, 0)
     laws = joints.laws[slots]
     one_sided = laws == STOP
-    error = select(table, error)
-    worlds = max(mass.shape[-1], error.shape[-1])
     free = np.where(np.isin(laws, CORRECTED) & ~np.isin(slots, left_out), np.inf, 0.0)
     law = Bounded(
         effective_mass=jax.lax.stop_gradient(pack_scalars(table, [1.0 / mass], worlds)),
@@ -128,8 +164,7 @@ def position_rows(
         upper=_bounds(table, free),
     )
     # A stop is taken at once: there is no manifold whose points could fight over it.
-    bias = jnp.where(one_sided[:, None], error, scene.options.position_percent * error)
-    return _pack(table, jacobians, responses, bias, law, worlds)
+    return jnp.where(one_sided[:, None], error, scene.options.position_percent * error), law
 
 
 def _bounds(table: Table, values: np.ndarray) -> Array:
@@ -170,6 +205,7 @@ def _moving_side(scene: Scene, table: Table, joints: JointRows) -> Side:
     return Side(where(moves, child.linear, parent.linear), where(moves, child.angular, parent.angular))
 
 
-def joint_impulse_start(table: Table, force: Array, dt: Array, worlds: int) -> Array:
+def joint_impulse_start(table: Table, force: Array, dt: Array, worlds: int, decoupling: Decoupling | None) -> Array:
     """Impulses (turn, 1, column, world) from the generalized forces of the last step (slot, world)."""
-    return pack_scalars(table, [select(table, force) * dt], worlds)
+    impulse = select(table, force) * dt
+    return pack_scalars(table, [impulse if decoupling is None else decoupling.impulses(impulse)], worlds)

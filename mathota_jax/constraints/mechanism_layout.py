@@ -15,7 +15,8 @@ from mathota_jax.solver.tree import GROUND, Tree
 _Slots = tuple[tuple[int, ...], tuple[int, ...]]
 
 LEAST_JOINTS = 3
-"""Joints of the smallest mechanism: two converge in a few sweeps, which are cheaper."""
+"""Joints of the smallest mechanism beside other rows: two converge in a few sweeps, which are cheaper. Where there are no
+others, no sweep is needed at all, and one joint is enough."""
 
 
 class Link(NamedTuple):
@@ -93,14 +94,25 @@ def layout(scene: Scene) -> Layout | None:
     # Between impacts bodies follow paths of constant force, which a closing of the joints would leave.
     if options.solver == "soft_step" or options.impact_events or not options.exact_joints:
         return None
+    found = _of_trees(scene, 1)
+    return found if found is not None and _has_no_others(scene, found) else _of_trees(scene, LEAST_JOINTS)
+
+
+def _of_trees(scene: Scene, least: int) -> Layout | None:
+    """All trees of at least so many joints; None if there is none."""
     held, ends = _held_joints(scene)
     links: list[Link] = []
     for joints in _components(ends, len(scene.dynamic_bodies)):
         grounded = sum(GROUND in ends[joint] for joint in joints)
         bodies = {block for joint in joints for block in ends[joint]} - {GROUND}
-        if len(joints) >= LEAST_JOINTS and grounded <= 1 and len(joints) == len(bodies) - 1 + grounded:
+        if len(joints) >= least and grounded <= 1 and len(joints) == len(bodies) - 1 + grounded:
             _grow(links, joints, ends, held)
     return Layout(tuple(links), len(scene.dynamic_bodies)) if links else None
+
+
+def _has_no_others(scene: Scene, found: Layout) -> bool:
+    """Whether the scene has no other rows than those of some mechanisms."""
+    return not scene.slot_count and len(found.slots) == joint_row_count(scene)
 
 
 @functools.cache
@@ -118,7 +130,7 @@ def looped_slots(scene: Scene) -> tuple[tuple[int, int, bool], ...]:
 def covers(scene: Scene) -> bool:
     """Whether the scene has no other rows than those that mechanisms hold."""
     found = layout(scene)
-    return found is not None and not scene.slot_count and len(found.slots) == joint_row_count(scene)
+    return found is not None and _has_no_others(scene, found)
 
 
 def covers_with_bounds(scene: Scene) -> bool:
@@ -149,16 +161,16 @@ def bounded_slots(scene: Scene) -> tuple[int, ...]:
 
 
 def _held_joints(scene: Scene) -> tuple[dict[int, _Slots], dict[int, tuple[int, ...]]]:
-    """Of each joint that holds anything: its slots as in `_held_slots`, and its velocity blocks or `GROUND`."""
+    """Of each joint that holds anything: its slots as in `held_slots`, and its velocity blocks or `GROUND`."""
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
     groups = joint_groups(scene)
-    held = {joint: _held_slots(group, place) for group in groups for place, joint in enumerate(group.joints)}
+    held = {joint: held_slots(group, place) for group in groups for place, joint in enumerate(group.joints)}
     held = {joint: slots for joint, slots in held.items() if any(slots)}
     bodies = {joint: (scene.joints[joint].parent, scene.joints[joint].child) for joint in held}
     return held, {joint: tuple(block_of.get(body, GROUND) for body in pair) for joint, pair in bodies.items()}
 
 
-def _held_slots(group: JointGroup, place: int) -> _Slots:
+def held_slots(group: JointGroup, place: int) -> _Slots:
     """Slots of the rows of a joint that hold translations, and rotations, whatever happens."""
     kind, row = group.kind, group.kind.fixed_row_count
     rows: tuple[list[int], list[int]] = ([*range(kind.fixed_translations)], [*range(kind.fixed_translations, row)])

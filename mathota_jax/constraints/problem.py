@@ -7,11 +7,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.bodies import Bodies, Inertia, moving, of_all_bodies, vector
+from mathota_jax.bodies import Bodies, Inertia, merge, moving, vector
 from mathota_jax.collision.narrowphase import ContactSet, join_contacts
 from mathota_jax.constraints import (
     compact,
     contact,
+    decoupling,
     joint,
     joint_layout,
     joint_rows,
@@ -22,6 +23,7 @@ from mathota_jax.constraints import (
     substep_rows,
     warm_start,
 )
+from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.slots import matched_force, own_contacts
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
@@ -42,7 +44,7 @@ class Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
 
     `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of
-    all groups, for the small steps alone.
+    all groups, for the small steps alone; `decouplings` are those of the joint rows, None where they are as they were.
     """
 
     joints: joint_rows.JointRows | None
@@ -53,6 +55,12 @@ class Problem(NamedTuple):
     contact_rows: list[contact.ContactRows]
     close: compact.ClosePairs | None
     errors: tuple[PositionError, ...] = ()
+    decouplings: tuple[Decoupling | None, ...] | None = None
+
+    @property
+    def of_joint_rows(self) -> tuple[Decoupling | None, ...]:
+        """Of each group of joint rows, how they were decoupled."""
+        return (None,) * len(self.joint_rows) if self.decouplings is None else self.decouplings
 
     @property
     def rows(self) -> tuple[Rows, ...]:
@@ -66,7 +74,7 @@ def constrain(
     blocks: Bodies,
     inertia: Inertia,
     free: tuple[Vec3, Vec3],
-    carried: Vec3 | None,
+    halfway: Bodies | None,
     gravity: Vec3,
     action: Array,
 ) -> Problem:
@@ -77,29 +85,34 @@ def constrain(
       bodies, blocks: all bodies and the moving ones at the start of the step.
       inertia: with which the moving bodies respond to impulses.
       free: their velocities at the end of the step without constraints.
-      carried: angular velocities at the middle of the step with the momentum of the start; None if they are the same.
+      halfway: the moving ones at the middle of the step without constraints, if they were followed that far.
       gravity: components (1, world).
       action: (motor, world).
     """
     scene = model.scene
     small_steps = scene.options.solver == "soft_step"
-    joints, held, responses, tables, errors = None, None, None, (), ()
+    joints, held, responses, tables, errors, decouplings = None, None, None, (), (), None
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
-        halfway = joint_rows.moved_by(bodies, 0.5 * model.dt)
-        if carried is not None:
-            halfway = halfway._replace(angular_velocity=of_all_bodies(scene, carried))
-        middle = joint_rows.joint_rows(model, halfway)
+        there = joint_rows.moved_by(bodies, 0.5 * model.dt)
+        if halfway is not None:
+            there = merge(scene, bodies, halfway)
+        middle = joint_rows.joint_rows(model, there)
         if mechanism_layout.layout(scene) is not None:
-            held = mechanism.links(scene, middle, moving(scene, halfway).position, inertia)
+            held = mechanism.links(scene, middle, moving(scene, there).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
         rows_of = substep_rows.joint_rows if small_steps else joint.velocity_rows
-        tables = tuple(rows_of(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene))
+        order = joint_layout.joint_tables(scene)
+        if decoupling.applies(scene):
+            found = [joint.decoupled_rows(scene, table, model, joint_motion) for table in order]
+            tables, decouplings = tuple(rows for rows, _ in found), tuple(how for _, how in found)
+        else:
+            tables = tuple(rows_of(scene, table, model, joint_motion) for table in order)
         if held is not None and (bounded := mechanism_layout.bounded_slots(scene)):
             responses = mechanism_rows.responses(held, tables, bounded)
             joint_motion = joint_motion._replace(responses=responses)
-            tables = tuple(rows_of(scene, table, model, joint_motion) for table in joint_layout.joint_tables(scene))
+            tables = tuple(rows_of(scene, table, model, joint_motion) for table in order)
         if small_steps:
             errors = tuple(substep_rows.joint_error(scene, rows, model, joint_motion) for rows in tables)
     contacts, contact_rows, close = None, [], None
@@ -121,7 +134,7 @@ def constrain(
         contacts = join_contacts(found)
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
-    return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors)
+    return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings)
 
 
 def starting_impulses(
@@ -152,7 +165,8 @@ def known_impulses(model: Model, problem: Problem, solved: Forces) -> tuple[Arra
 def _impulses(model: Model, problem: Problem, joint_force: Array, contact_force: Vec3 | None) -> tuple[Array, ...]:
     """Impulses (turn, row, column, world) of all groups from forces in the order of slots."""
     impulses = [
-        joint.joint_impulse_start(rows.table, joint_force, model.dt, rows.bias.shape[-1]) for rows in problem.joint_rows
+        joint.joint_impulse_start(rows.table, joint_force, model.dt, rows.bias.shape[-1], how)
+        for rows, how in zip(problem.joint_rows, problem.of_joint_rows, strict=True)
     ]
     if contact_force is not None:
         impulses += [contact.warm_start_impulse(group, contact_force, model.dt) for group in problem.contact_rows]

@@ -31,7 +31,15 @@ TOUCHING = 1e-3
 """Gap at which bodies stop, as a share of the inner radius of the smaller one; and tolerance of the search."""
 
 SINKING = 0.1
-"""Share of the same radius by which bodies that touch already may approach: less than what would pass them through."""
+"""Share of the same radius by which bodies that touch already may approach in a step: less than what would pass them
+through."""
+
+DEEPEST = 0.5
+"""Share of the same radius at which almost nothing of that is left: a stick that spins on the ground would sink a little in
+every step, and in the end through it."""
+
+LEAST_SINKING = 0.02
+"""What is left then, as a share of `SINKING`: with nothing a body could not turn out of what it is in."""
 
 ADVANCES = 64
 """Largest number of advances; what is left then counts as a touch, so that nothing passes through."""
@@ -173,7 +181,9 @@ def _first_touch(model: Model, group: PairGroup, pairs: _Pairs, share: Array) ->
     zero = jnp.zeros_like(ends[0])
     gap, normal = _closest(model, group, pairs, zero, zero)
     touch = TOUCHING * pairs.size
-    target = jnp.where(gap > 2.0 * touch, touch, jnp.minimum(gap, 0.0) - SINKING * pairs.size)
+    depth = jnp.minimum(gap, 0.0)
+    further = SINKING * pairs.size * jnp.clip(1.0 + depth / (DEEPEST * pairs.size), LEAST_SINKING, 1.0)
+    target = jnp.where(gap > 2.0 * touch, touch, depth - further)
 
     def bound(normal: Vec3, time: Array) -> Array:
         """Of the approach along the normal in a unit of time; a body at the end of its motion stands."""

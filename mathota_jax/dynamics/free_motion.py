@@ -33,7 +33,7 @@ def free_velocity(
 
     Args:
       bodies, inertia: moving bodies.
-      carried: angular velocities that already have the gyroscopic term, see `carried_velocity`; None where there are none.
+      carried: angular velocities that already have the gyroscopic term, see `drift`; None where there are none.
       gravity: (1, world) components [m/s^2].
       force, torque: external, on each moving body, world frame.
       dt: time step [s].
@@ -51,20 +51,25 @@ def free_velocity(
     return linear, angular + inertia.solve(torque) * dt
 
 
-def carried_velocity(bodies: Bodies, start: Inertia, middle: Inertia) -> Vec3:
-    """Angular velocities at the middle of the step that have the momentum, and the energy, of its start.
+def drift(bodies: Bodies, inertia: Inertia, time: Array) -> tuple[Inertia, Bodies]:
+    """Bodies after some time without forces, and their inertia there.
 
-    A row of the middle of the step needs the inertia of that moment too: a torque across a thin rod, seen from where the
-    rod was, has a part along it, where the moment is thousands of times less.
+    What joints do, they do at the middle of the step: rows of that moment need its inertia too, and the momentum that the
+    bodies bring along. A torque across a thin rod, seen from where the rod was or will be, has a part along it, where the
+    moment is thousands of times less; and so has a momentum that does not belong to the way the rod has turned.
 
     Args:
-      bodies: moving bodies at the start.
-      start, middle: their inertia then and half a step later.
+      bodies, inertia: moving bodies, not all spherical, at the start.
+      time: until then [s].
     """
-    momentum = start.apply(bodies.angular_velocity)
-    carried = middle.solve(momentum)
-    energy, found = dot(bodies.angular_velocity, momentum), dot(carried, momentum)
-    return carried * jnp.where(found > 0, safe_sqrt(safe_divide(energy, found)), 1.0)
+    momentum = inertia.apply(bodies.angular_velocity)
+    orientation, _ = rotate_at_constant_momentum(bodies.orientation, inertia, momentum, time)
+    there = inertia.at(orientation)
+    angular = there.solve(momentum)
+    # For bodies that turn too fast to be followed.
+    energy, found = dot(bodies.angular_velocity, momentum), dot(angular, momentum)
+    angular = angular * jnp.where(found > 0, safe_sqrt(safe_divide(energy, found)), 1.0)
+    return there, Bodies(bodies.position + bodies.velocity * time, orientation, bodies.velocity, angular)
 
 
 def rotate_at_constant_momentum(

@@ -8,7 +8,7 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia, unpack_blocks
 from mathota_jax.dynamics.free_motion import rotate_at_constant_momentum
-from mathota_jax.spatial.quaternion import exponential, multiply, normalize, rotate
+from mathota_jax.spatial.quaternion import exponential, multiply, normalize, rotate, turn_between
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3, dot
@@ -18,6 +18,7 @@ def advance(
     bodies: Bodies,
     inertia: Inertia,
     acting: Inertia,
+    halfway: Bodies | None,
     free: tuple[Vec3, Vec3],
     torque: Vec3,
     decay: float | Array,
@@ -35,6 +36,7 @@ def advance(
     Args:
       bodies, inertia: moving bodies at the start of the step.
       acting: inertia with which they responded to the impulses.
+      halfway: where they did so, at the middle of the step, with that inertia; None if at its start.
       free: linear and angular velocity at the end of the step without constraints.
       torque: external torque, world frame.
       decay: factor by which damping reduces the angular momentum in this step.
@@ -68,8 +70,14 @@ def advance(
             assert lever is not None
             mean = mean + change * (lever / dt)
     mean, end, shift = compute_once((mean, end, shift), bodies.position.x)
-    orientation, turn = rotate_at_constant_momentum(bodies.orientation, inertia, mean, dt)
-    orientation = compute_once(orientation, bodies.position.x)
+    if halfway is None:
+        orientation, turn = rotate_at_constant_momentum(bodies.orientation, inertia, mean, dt)
+        orientation = compute_once(orientation, bodies.position.x)
+    else:
+        # The first half had the momentum of the start.
+        orientation, _ = rotate_at_constant_momentum(halfway.orientation, acting, mean * 2.0 - start, 0.5 * dt)
+        orientation = compute_once(orientation, bodies.position.x)
+        turn = turn_between(bodies.orientation, orientation)
     if inertia.rotation is None:
         angular = inertia.solve(end)
     else:
@@ -80,7 +88,7 @@ def advance(
         angular = angular * _energy_scale(
             acting, free_angular if solved_angular is None else solved_angular, angular, end, turn
         )
-        turn = inertia.rotation.apply(turn)
+        turn = inertia.rotation.apply(turn) if halfway is None else turn
     moved = Bodies(bodies.position + shift, orientation, solved_linear, angular)
     return moved, (shift, turn)
 

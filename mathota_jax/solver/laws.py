@@ -88,8 +88,10 @@ class Cone:
         (old_1, old_2), (error_1, error_2) = old, errors
         free_1 = old_1 - error_1 * self.tangent_mass
         free_2 = old_2 - error_2 * self.tangent_mass
-        squared = free_1 * free_1 + free_2 * free_2
-        limit = self.friction * normal
+        # Compared as velocities: the square of the impulse of a body of 0.1 mm underflows.
+        inverse = safe_divide(jnp.ones_like(self.tangent_mass), self.tangent_mass)
+        speed_1, speed_2, limit = free_1 * inverse, free_2 * inverse, self.friction * normal * inverse
+        squared = speed_1 * speed_1 + speed_2 * speed_2
         # At the apex of the cone nothing sticks: a derivative must not see friction where nothing presses.
         sliding = squared >= limit * limit
         scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)

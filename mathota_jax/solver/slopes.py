@@ -108,7 +108,9 @@ def _of_cone(law: Cone, impulse: Array, error: Array) -> ConeSlopes:
     free = old - error_n * law.normal_mass
     normal, pressing = jax.jvp(lambda x: jnp.maximum(x, 0.0), (free,), (jnp.ones_like(free),))
     free_1, free_2 = (part - slip * law.tangent_mass for part, slip in zip(tangents, errors, strict=True))
-    squared, limit = free_1 * free_1 + free_2 * free_2, law.friction * normal
+    inverse = safe_divide(jnp.ones_like(law.tangent_mass), law.tangent_mass)  # as velocities, see `Cone`
+    free_1, free_2, limit = free_1 * inverse, free_2 * inverse, law.friction * normal * inverse
+    squared = free_1 * free_1 + free_2 * free_2
     sliding, size = squared >= limit * limit, safe_sqrt(squared)
     direction = tuple(jnp.where(sliding, safe_divide(part, size), 0.0) for part in (free_1, free_2))
     return ConeSlopes(

@@ -85,3 +85,8 @@ def logarithm(q: Quaternion) -> Vec3:
     small = sine < jnp.sqrt(jnp.finfo(sine.dtype).eps)
     angle = 2.0 * jnp.arctan2(jnp.where(small, 1.0, sine), q.w * sign)
     return axis * jnp.where(small, 2.0, safe_divide(angle, jnp.where(small, 1.0, sine)))
+
+
+def turn_between(first: Quaternion, second: Quaternion) -> Vec3:
+    """Rotation vector, in the world frame, that turns the first orientation into the second the short way round."""
+    return logarithm(multiply(second, Quaternion(first.w, -first.x, -first.y, -first.z)))

@@ -9,7 +9,7 @@ import pytest
 from mathota_jax import BallAndSocket, Box, Hinge, SceneBuilder, Sphere
 from tests.scenes import DOWN, invariants, motion, record_worlds, repeat, rotation_matrix, undamped
 
-SOLVERS = {"default": {}, "converged": {"solver": "converged"}}
+SOLVERS = {"default": {}, "converged": {"solver": "converged"}, "sweeps": {"exact_joints": False}}
 QUICK_AND_SLOW = ["default", pytest.param("converged", marks=pytest.mark.slow)]
 
 # links: tip at 0.5 s and at 1 s (DOP853, relative tolerance 1e-12).
@@ -79,7 +79,7 @@ def test_other_chains_do_not_blow_up_at_a_large_step(links, solver, gate):
     test_chain_does_not_blow_up_at_a_large_step(links, solver, gate)
 
 
-@pytest.mark.parametrize("solver", QUICK_AND_SLOW)
+@pytest.mark.parametrize("solver", [*QUICK_AND_SLOW, "sweeps"])
 def test_thin_rods_do_not_blow_up_at_a_large_step(float64, solver, gate):
     _, tip, energy = swing(2, 1 / 60, 2.0, thickness=0.01, **SOLVERS[solver])
     assert np.isfinite(tip).all()
