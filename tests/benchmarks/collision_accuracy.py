@@ -61,7 +61,7 @@ def table(rows: list[dict]) -> str:
         "*Flagged*: `converged` is false, the answer is not proved. *Wrong*: separation or normal beyond the gate of "
         f"{GATES['float32'][0]:g} (float32),",
         f"{GATES['float64'][0]:g} (float64), {GATES['float64'][1]:g} (float64 with a cylinder or cone).",
-        "Spheres in \"needles: random\" are 50 to 1900 of their sizes apart, which float32 can not tell to the gate: they err",
+        'Spheres in "needles: random" are 50 to 1900 of their sizes apart, which float32 can not tell to the gate: they err',
         "by 3e-7 of the distance.",
     ]
     for precision in sorted({r["precision"] for r in rows}):
