@@ -32,6 +32,10 @@ LONGEST_STEP = 0.5
 """Newton steps turn the normal by at most this angle [rad]; a longer one means that the pieces are not the right ones."""
 ROUNDING = 16.0
 """Separations that differ by fewer round-offs of the size are equal."""
+LEAST_WEIGHT = 0.01
+"""A tied piece pair of less than minus this weight does not hold the others back from the solution, and leaves."""
+ASIDE = 1e-7
+"""Closest points this far [size] beside the normal do not lie along it; in float32 some round-offs more."""
 STIFFNESS_ROUNDING = 64.0
 """A stiffness below this many round-offs leaves the normal where it is."""
 
@@ -75,6 +79,7 @@ class _Search(NamedTuple):
     normal: Vec3
     ties: Ties
     best: Solution
+    left: Array
     done: Array
 
 
@@ -145,26 +150,36 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
         extreme, pieces = shapes.least(normal)
         reach = dot(normal, extreme)
         turned = normal - state.normal
+        weights = barycentric(points, state.ties.two, state.ties.three)
+        sound = True
+        if curved:
+            # Where a piece pair has left, what remains must have its closest point along the normal.
+            across = combine(weights, points)
+            across = across - normal * dot(normal, across)
+            sound = ~state.left | (dot(across, across) <= max(8.0 * rounding, ASIDE) ** 2)
         consistent = model - reach <= 4.0 * rounding
         best = state.best
         code = (reach > best.separation).astype(reach.dtype) + 2.0 * (reach > best.separation - rounding)
-        code = settle_code(jnp.where(state.done, 0.0, code + 4.0 * consistent))
+        code = settle_code(jnp.where(state.done, 0.0, code + 4.0 * consistent + 8.0 * sound))
         # Near the solution the separation is flat: the latest consistent normal is the best, to more than half the digits.
-        better = (code >= 6) | ((code & 1 == 1) & ~best.exact)
+        better = (code & 14 == 14) | ((code & 1 == 1) & ~best.exact)
         exact = (code & 4) == 4
         here = Solution(normal, reach, state.ties, exact)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), here, best)
         still = dot(turned, turned) <= rounding * rounding
-        weights = barycentric(points, state.ties.two, state.ties.three)
         ties = _join(state.ties, pieces, weights, ~exact)
-        done = state.done | (exact & still if curved else exact)
-        return _Search(state.turn + 1, normal, ties, best, done)
+        if not curved:
+            return _Search(state.turn + 1, normal, ties, best, state.left, state.done | exact)
+        ties, leaves = _leave(ties, weights, exact)
+        return _Search(state.turn + 1, normal, ties, best, state.left | leaves, state.done | (exact & still & ~leaves))
 
     curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
     extreme, pieces = shapes.least(simplex.direction)
     reach = dot(simplex.direction, extreme)
     first = Solution(simplex.direction, reach, _single(pieces), jnp.zeros(reach.shape, bool))
-    state = _Search(jnp.zeros((), jnp.int32), simplex.direction, distinct(simplex.pieces), first, ~wanted)
+    state = _Search(
+        jnp.zeros((), jnp.int32), simplex.direction, distinct(simplex.pieces), first, wanted & ~wanted, ~wanted
+    )
     steps = CURVED_STEPS if curved else POLYTOPE_STEPS
     return lax.while_loop(lambda s: (s.turn < steps) & ~jnp.all(s.done), advance, state).best
 
@@ -177,11 +192,27 @@ def _join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
     """Adds a piece pair; of three tied ones it replaces the one of the least weight."""
     first, second, third = ties.pieces
     wanted = wanted & (pieces != first) & ~(ties.two & (pieces == second)) & ~(ties.three & (pieces == third))
-    lowest = jnp.where(weights[0] <= jnp.minimum(weights[1], weights[2]), 0, jnp.where(weights[1] <= weights[2], 1, 2))
-    slot = jnp.where(ties.three, lowest, jnp.where(ties.two, 2, 1))
+    slot = jnp.where(ties.three, _lightest(weights), jnp.where(ties.two, 2, 1))
     slot = settle_code(jnp.where(wanted, slot, -1).astype(weights[0].dtype))
     first, second, third = (jnp.where(slot == k, pieces, old) for k, old in enumerate((first, second, third)))
     return Ties((first, second, third), ties.two | (slot == 1), ties.three | (slot == 2))
+
+
+def _leave(ties: Ties, weights: Weights, wanted: Array) -> tuple[Ties, Array]:
+    """Takes out the tied piece pair beyond which the closest point lies, and tells whether there was one."""
+    third = jnp.where(ties.three, weights[2], jnp.inf)
+    weights = weights[0], jnp.where(ties.two, weights[1], jnp.inf), third
+    slot = _lightest(weights)
+    beyond = wanted & (jnp.minimum(weights[0], jnp.minimum(weights[1], third)) < -LEAST_WEIGHT)
+    slot = settle_code(jnp.where(beyond, slot, -1).astype(third.dtype))
+    first, second, third = ties.pieces
+    pieces = jnp.where(slot == 0, second, first), jnp.where((slot == 0) | (slot == 1), third, second), third
+    leaves = slot >= 0
+    return Ties(pieces, jnp.where(leaves, ties.three, ties.two), ties.three & ~leaves), leaves
+
+
+def _lightest(weights: Weights) -> Array:
+    return jnp.where(weights[0] <= jnp.minimum(weights[1], weights[2]), 0, jnp.where(weights[1] <= weights[2], 1, 2))
 
 
 def distinct(pieces: tuple[Array, ...]) -> Ties:
