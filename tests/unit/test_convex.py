@@ -122,6 +122,19 @@ def test_the_two_oracles_agree(pair):
     np.testing.assert_allclose(truths, expected, atol=1e-10)
 
 
+def test_a_side_that_ends_before_it_crosses_the_other():
+    """The lines of contact of two cylinders, of size ratio 1:1000, cross beyond the end of the small one."""
+    scene = {
+        "a": {"half_height": np.array([8.748348e-4]), "radius": np.array([6.637906e-4])},
+        "b": {"half_height": np.array([0.9493164420127869]), "radius": np.array([0.28529810905456543])},
+        "pa": np.array([[-0.01651114, -0.08964566, 0.20927234]]),
+        "pb": np.array([[-0.28698921, -0.12458938, 0.11371686]]),
+        "qa": np.array([[-0.72245622, 0.57233173, 0.38281742, -0.06280313]]),
+        "qb": np.array([[0.78086001, 0.42143002, -0.45894176, 0.04502007]]),
+    }
+    check(("cylinder", "cylinder"), scene, np.dtype("float32"))
+
+
 def test_a_corner_that_all_but_meets_a_corner(precision):
     """A hull with a corner pressed into a face of a box by next to nothing, at 1e-6 to 1e-2 from the corner of the face."""
     pair, count = ("box", "polyhedron"), 400
