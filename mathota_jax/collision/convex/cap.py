@@ -21,7 +21,7 @@ from jax import Array
 
 from mathota_jax.collision.convex.difference import Difference, Weights, barycentric
 from mathota_jax.collision.convex.polish import Solution, rim_radii, stacked_differences
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3, cross, dot, tangent_basis
 
 
@@ -87,8 +87,9 @@ def proved_cap(shapes: Difference, found: Solution, tolerance: float) -> Cap:
     form = _Form(*compute_once(tuple(_curvature(shapes, found, weights, u, v)), depth))
     flattest, rho = _least_reach(tangents, form, depth)
     certain = error <= 0.5 * tolerance
-    whole = certain & (flattest >= depth)
-    return Cap(whole | (certain & (rho >= depth)), whole)
+    whole, half = certain & (flattest >= depth), certain & (rho >= depth)
+    code = settle_code((2.0 * whole + (half & ~whole)).astype(depth.dtype))
+    return Cap(code > 0, code == 2)
 
 
 def _curvature(shapes: Difference, found: Solution, weights: Weights, u: Vec3, v: Vec3) -> _Form:

@@ -81,10 +81,11 @@ class _Stack(NamedTuple):
         all_names, all_bounds, size, lower = self
         for name, bound in zip(names, bounds, strict=True):
             fits = (bound < limit) & (size < self.names.shape[0])
-            lower = jnp.where(fits, lower, jnp.minimum(lower, bound))
-            here = rows == settle_code(jnp.where(fits, size, -1).astype(bound.dtype))
+            slot = settle_code(jnp.where(fits, size, -1).astype(bound.dtype))
+            lower = jnp.where(slot >= 0, lower, jnp.minimum(lower, bound))
+            here = rows == slot
             all_names, all_bounds = jnp.where(here, name, all_names), jnp.where(here, bound, all_bounds)
-            size = size + fits
+            size = size + (slot >= 0)
         return _Stack(all_names, all_bounds, size, lower)
 
 
@@ -208,7 +209,7 @@ def _put(table: Vec3, value: Vec3, index: Array) -> Vec3:
 def _sample(shapes: Difference, direction: Vec3) -> tuple[Vec3, Array]:
     """Support point of A - B along a unit direction from A to B, and its height."""
     point = compute_once(-shapes.least(direction)[0], direction.x)
-    return point, dot(point, direction)
+    return point, compute_once(dot(point, direction), direction.x)
 
 
 def _crossing(corners: tuple, points: tuple, i: int, j: int) -> tuple[Vec3, Array, Array]:
