@@ -13,6 +13,10 @@ import numpy as np
 from mathota_jax.fit.objective import Linearised
 
 
+NOISE = 64.0
+"""Columns shorter than this many round-offs of the longest say nothing; 2e-6 of it were seen, by the mass of a free ball."""
+
+
 class Weights(NamedTuple):
     """How much each residual counts.
 
@@ -77,7 +81,7 @@ def normal_equations(found: Linearised, weights: Weights, free: np.ndarray) -> N
     residual = np.asarray(found.residual, float)
     factor = robust_factor(residual, weights)
     residual = factor * residual
-    by_parameters = factor[..., None] * np.asarray(found.by_parameters, float)
+    by_parameters = _influence(factor[..., None] * np.asarray(found.by_parameters, float), found.by_parameters)
     size = by_parameters.shape[-1]
     flat = by_parameters.reshape(-1, size)
     matrix, gradient = flat.T @ flat, flat.T @ residual.ravel()
@@ -99,6 +103,7 @@ def normal_equations(found: Linearised, weights: Weights, free: np.ndarray) -> N
         columns = [
             scale * np.asarray(part, float) for part in (found.gap_by_parameters, found.gap_by_start, found.gap_by_next)
         ]
+        columns[0] = _influence(columns[0], found.gap_by_parameters)
         jump_flat = columns[0].reshape(-1, size)
         matrix = matrix + jump_flat.T @ jump_flat
         gradient = gradient + jump_flat.T @ gap.ravel()
@@ -117,6 +122,16 @@ def normal_equations(found: Linearised, weights: Weights, free: np.ndarray) -> N
         gradient,
         start_gradient.reshape(count, length)[:, free],
     )
+
+
+def _influence(slopes: np.ndarray, source: Any) -> np.ndarray:
+    """Weighted slopes (..., p) without the columns that are nothing but round-off of the number type of `source`.
+
+    The mass of a body that has met nothing yet would be changed by any factor for a millionth of the residual.
+    """
+    length = np.linalg.norm(slopes.reshape(-1, slopes.shape[-1]), axis=0)
+    noise = NOISE * np.finfo(np.asarray(source).dtype).eps * length.max(initial=0.0)
+    return np.where(length > noise, slopes, 0.0)
 
 
 def solve(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
