@@ -12,7 +12,6 @@ import numpy as np
 
 from mathota_jax.fit.objective import Linearised
 
-
 NOISE = 64.0
 """Columns shorter than this many round-offs of the longest say nothing; 2e-6 of it were seen, by the mass of a free ball."""
 
