@@ -25,7 +25,7 @@ from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.mechanism_layout import held_slots, layout
 from mathota_jax.scene import Scene
 from mathota_jax.solver.table import EMPTY, Table
-from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_slices
@@ -70,17 +70,21 @@ class Decoupling:
 
     def impulses(self, values: Array) -> Array:
         """Impulses (turn * column, world) of the new rows from those of the old ones."""
-        by_joint = self.layout.by_joint(values)
+        by_joint = self._in_worlds(self.layout.by_joint(values))
         for row, share in zip(self.layout.pivots, self.shares, strict=True):
             by_joint = by_joint.at[row].add(add_slices(share * by_joint, 0))
         return self.layout.by_place(by_joint)
 
     def original_impulses(self, values: Array) -> Array:
         """The other way round."""
-        by_joint = self.layout.by_joint(values)
+        by_joint = self._in_worlds(self.layout.by_joint(values))
         for row, share in reversed(list(zip(self.layout.pivots, self.shares, strict=True))):
             by_joint = by_joint.at[row].add(-add_slices(share * by_joint, 0))
         return self.layout.by_place(by_joint)
+
+    def _in_worlds(self, values: Array) -> Array:
+        """In as many worlds as the shares: impulses that all share differ once they are those of the new rows."""
+        return in_every_world(values, max(values.shape[-1], self.matrix.shape[-1]))
 
 
 @dataclasses.dataclass(frozen=True)
