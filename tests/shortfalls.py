@@ -47,11 +47,6 @@ SHORTFALLS: dict[str, str] = {
     + "the plate turns 1.12e-4 rad out of its gimbal, gate 1e-4: each joint is solved exactly, but an error of the plate is "
     "taken by the lighter frame, and then by its joint; 5.5e-6 with 50 sweeps over positions in place of 3",
     **{
-        f"tests/unit/test_state.py::test_nothing_assumes_an_up_axis[{axis}]": "the order of the sweeps follows the axes of "
-        "the tangents: 3e-6 to 3e-5 rad/s apart after the impact of a box, gate 1e-6"
-        for axis in ("Z up", "X up")
-    },
-    **{
         f"tests/unit/test_converged.py::test_contact_laws_hold[{case}-10000.0]": "mass ratio 1e4 among bodies hit at "
         "random points, from nothing: the converged solver reaches its limit of 150 iterations or misses the gate"
         for case in ("float32-1", "float32-2", "float32-3", "float32-4", "float32-5", "float64-3")
