@@ -10,7 +10,7 @@ from mathota_jax.bodies import Bodies, Inertia, unpack_blocks
 from mathota_jax.dynamics.free_motion import rotate_at_constant_momentum
 from mathota_jax.spatial.quaternion import exponential, multiply, normalize, rotate, turn_between
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.spatial.vector import Vec3, dot
 
 
@@ -88,6 +88,8 @@ def advance(
         angular = angular * _energy_scale(
             acting, free_angular if solved_angular is None else solved_angular, angular, end, turn
         )
+        # Else its expressions end in the array of the new state, and are worked out element by element.
+        angular = materialize(angular)
         turn = inertia.rotation.apply(turn) if halfway is None else turn
     moved = Bodies(bodies.position + shift, orientation, solved_linear, angular)
     return moved, (shift, turn)
