@@ -9,8 +9,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.spatial.settle import settle_code, store
+from mathota_jax.spatial.spread import add_slices, greatest, least
 from mathota_jax.spatial.vector import Vec3
 
+FEW_ROWS = 8
+"""Up to so many, a row is picked within the expression that needs it; of more, before it."""
 LEAN = Vec3(0.48, 0.36, 0.8)
 """Unit vector toward which scores lean, so that equally good candidates do not take turns in a tremor."""
 LEAN_SHARE = 1e-3
@@ -48,9 +51,10 @@ def best_candidate(score: Array) -> tuple[Array, Array]:
     """
     score = lax.stop_gradient(score)
     score = store(score, score)
-    best = jnp.max(score, axis=0)
+    best = greatest(score)
+    best = store(best, best)
     number = numbers(score.shape[0], score)
-    return best, settle_code(jnp.min(jnp.where(score >= best, number, float(score.shape[0] - 1)), axis=0))
+    return best, settle_code(least(jnp.where(score >= best, number, float(score.shape[0] - 1))))
 
 
 def numbers(count: int, like: Array) -> Array:
@@ -70,6 +74,7 @@ def pick(values: Any, index: Array) -> Any:
 
     def one(value: Array) -> Array:
         row = jnp.arange(value.shape[0], dtype=jnp.int32).reshape((-1,) + (1,) * (value.ndim - 1))
-        return jnp.sum(jnp.where(row == index, value, jnp.zeros((), value.dtype)), axis=0, dtype=value.dtype)
+        chosen = jnp.where(row == index, value, jnp.zeros((), value.dtype))
+        return add_slices(chosen, 0) if len(value) <= FEW_ROWS else jnp.sum(chosen, axis=0, dtype=value.dtype)
 
     return jax.tree.map(one, values)

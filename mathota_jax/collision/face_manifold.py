@@ -23,6 +23,7 @@ from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle_code
+from mathota_jax.spatial.spread import greatest, least
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, normalize, tangent_basis, where
 
 ALIGNED_COSINE = 0.995
@@ -258,7 +259,7 @@ def _search(
 def _extent(face: _Face) -> Array:
     """Largest distance of a corner from the first one."""
     offset = face.corners - face.corners.map(lambda c: c[:1])
-    return safe_sqrt(jnp.max(dot(offset, offset), axis=0))
+    return safe_sqrt(greatest(dot(offset, offset)))
 
 
 def _beyond(u: Array, v: Array, along_u: Array, along_v: Array) -> Array:
@@ -272,8 +273,8 @@ def _candidates(
     """Vertices of the patch, from the gaps at the incident and at the reference corners."""
     distance = _distance(reference, incident.outer_u, incident.outer_v) + widening
     crossing, rate = _crossing(reference, distance, incident.along_u, incident.along_v)
-    enter = jnp.max(jnp.where(rate > 0, crossing, jnp.where((rate == 0) & (distance < 0), 2.0, 0.0)), axis=0)
-    leave = jnp.min(jnp.where(rate < 0, crossing, 1.0), axis=0)
+    enter = greatest(jnp.where(rate > 0, crossing, jnp.where((rate == 0) & (distance < 0), 2.0, 0.0)))
+    leave = least(jnp.where(rate < 0, crossing, 1.0))
     enter, leave = jnp.maximum(enter, 0.0), jnp.minimum(leave, 1.0)
     edges = incident.u, incident.v, gap
     starts = [value + enter * (_next(value) - value) for value in edges]
@@ -281,7 +282,7 @@ def _candidates(
     # An edge that is not cut ends where the next one starts.
     starts.append((enter <= leave) & (enter < 1.0) & usable)
     ends.append((enter < leave) & (leave < 1.0) & usable)
-    within = jnp.min(_distance(incident, reference.u, reference.v), axis=0)
+    within = least(_distance(incident, reference.u, reference.v))
     corners = [reference.u, reference.v, corner_gap, (within >= 0) & usable]
 
     fields = []

@@ -5,15 +5,15 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
+from mathota_jax.bodies import Inertia, unpack_blocks
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.scene import Scene
 from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_slices
-from mathota_jax.spatial.vector import Vec3
+from mathota_jax.spatial.spread import add_all_slices
+from mathota_jax.spatial.vector import Vec3, dot
 
 
 def matched_force(scene: Scene, contacts: ContactSet, force: Vec3, feature: Array) -> list[Vec3]:
@@ -74,13 +74,17 @@ def plausible(
       start: for each group (turn, row, column, world).
     """
     change = add_impulses(rows, jnp.zeros_like(velocity), start)
-    linear, angular = unpack_blocks(change)
-    momentum = pack_blocks(linear * (1.0 / inertia.inverse_mass), None if angular is None else inertia.apply(angular))
-    slope = _total(velocity * momentum)
+    (before, turning), (linear, angular) = unpack_blocks(velocity), unpack_blocks(change)
+    momentum = linear * (1.0 / inertia.inverse_mass)
+    slope, curvature = dot(before, momentum), dot(linear, momentum)
+    if turning is not None and angular is not None:
+        spin = inertia.apply(angular)
+        slope, curvature = slope + dot(turning, spin), curvature + dot(angular, spin)
+    slope, curvature = _total(slope), _total(curvature)
     for group, impulse in zip(rows, start, strict=True):
-        slope = slope + _total(add_slices(group.bias * impulse, 1))
+        slope = slope + _total(group.bias * impulse)
     # Stored: every impulse needs their sum over all bodies.
-    slope, curvature = compute_once((slope, _total(change * momentum)), velocity)
+    slope, curvature = compute_once((slope, curvature), velocity)
     worse = slope + 0.5 * curvature > 0
     scale = jnp.where(worse, jnp.clip(safe_divide(-slope, curvature), 0.0, 1.0), 1.0)
     # The start does not move the solution.
@@ -88,6 +92,5 @@ def plausible(
 
 
 def _total(terms: Array) -> Array:
-    """Sum (world,) of (..., ..., world): what XLA would make of both axes at once is a scalar loop."""
-    shorter = 0 if terms.shape[0] < terms.shape[1] else 1
-    return add_slices(terms, shorter).sum(0)
+    """Sum (world,) of finite terms (..., world), each computed once."""
+    return add_all_slices(compute_once(terms, terms))

@@ -19,6 +19,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mathota_jax.spatial.indexing import unstack
+from mathota_jax.spatial.settle import store
 
 FEW_SLICES = 64
 """Beyond, a loop of the library costs less than the code of as many terms takes to compile."""
@@ -43,15 +44,28 @@ def add_slices(array: Array, axis: int) -> Array:
 
 
 def add_all_slices(array: Array) -> Array:
-    """Sum (world,) along all axes but the last."""
-    slices = array.reshape(-1, array.shape[-1])
-    return add_slices(slices, 0) if len(slices) <= FEW_SLICES else slices.sum(0)
+    """Sum (world,) of finite numbers along all axes but the last."""
+    if array.size <= FEW_SLICES * array.shape[-1]:
+        return add_slices(array.reshape(-1, array.shape[-1]), 0)
+    while array.ndim > 1:
+        array = store(array, array)
+        array = add_slices(array, 0) if len(array) <= FEW_SLICES else array.sum(0)
+    return array
 
 
 def largest_slice(array: Array) -> Array:
     """Maximum (world,) along all axes but the last."""
-    slices = array.reshape(-1, array.shape[-1])
-    return functools.reduce(jnp.maximum, unstack(slices, 0)) if len(slices) <= FEW_SLICES else slices.max(0)
+    return greatest(array.reshape(-1, array.shape[-1]))
+
+
+def greatest(array: Array) -> Array:
+    """Maximum along the leading axis."""
+    return functools.reduce(jnp.maximum, unstack(array, 0)) if len(array) <= FEW_SLICES else array.max(0)
+
+
+def least(array: Array) -> Array:
+    """Minimum along the leading axis."""
+    return functools.reduce(jnp.minimum, unstack(array, 0)) if len(array) <= FEW_SLICES else array.min(0)
 
 
 def _broadcast(array: Array, *, shape: tuple[int, ...]) -> Array:

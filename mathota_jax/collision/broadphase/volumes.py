@@ -71,9 +71,13 @@ def finite_bounds(bounds: Bounds) -> tuple[Bounds, Array]:
 
 
 def overlaps(bounds: Bounds, first: Array, second: Array) -> tuple[Array, Array]:
-    """Whether boxes and spheres overlap (guide 5.2 and 5.3), and by how much the boxes do along the best axis [m]."""
+    """`overlap` of pairs of shapes, given by index."""
     volumes = bounds._replace(planes=None)
-    one, other = gather_together(volumes, first), gather_together(volumes, second)
+    return overlap(gather_together(volumes, first), gather_together(volumes, second))
+
+
+def overlap(one: Bounds, other: Bounds) -> tuple[Array, Array]:
+    """Whether boxes and spheres overlap (guide 5.2 and 5.3), and by how much the boxes do along the best axis [m]."""
     top, bottom = jax.tree.map(jnp.minimum, one.high, other.high), jax.tree.map(jnp.maximum, one.low, other.low)
     along = top - bottom
     depth = jnp.minimum(jnp.minimum(along.x, along.y), along.z)
