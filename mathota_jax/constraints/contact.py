@@ -29,7 +29,7 @@ from mathota_jax.constraints.assembly import (
     smaller_side,
     turn_of_points,
 )
-from mathota_jax.constraints.effective_mass import entries_of, normal_bound, tangent_bound
+from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -167,8 +167,9 @@ def contact_rows(
     else:
         target, lever = impact(approach, model.dt)
     active = compute_once(pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0], normal.x)
-    # Empty columns of a table have no response.
-    entries = entries_of(matrix.dense())
+    # The length of a step does not move the fixed point: its derivative is not worth computing. Empty columns of a table
+    # have no response.
+    entries = jax.lax.stop_gradient(matrix).entries()
     mass = safe_divide(active, normal_bound(entries, table.together, active))
     bias = [-target]
     if scene.friction:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from mathota_jax.solver.coupling import point_responses
-from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.spatial.indexing import unstack
+from mathota_jax.solver.row_matrix import Entries
 from mathota_jax.spatial.safe import safe_sqrt
 from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.spatial.spread import add_slices
-
-Entries = list[list[list[Array]]]
-"""Components (turn, column, world) by side and row."""
 
 NORMAL_RELAXATION = 10 / 9
 """Factor on the bounded normal step of three points and more: makes it exact for a cube on its face."""
@@ -25,21 +20,6 @@ NORMAL_RELAXATION = 10 / 9
 TANGENT_RELAXATION = 4 / 3
 """Factor on the bounded tangential step of a manifold. Measured: ten boxes stand with 10 sweeps at 4/3 and lean at 1;
 against the largest eigenvalue itself, boxes that were dropped creep."""
-
-
-def entries_of(matrix: Dense) -> tuple[Entries, Entries]:
-    """Entries of Jacobian and response for the bounds below."""
-    # The length of a step does not move the fixed point: its derivative is not worth computing.
-    matrix = jax.lax.stop_gradient(matrix)
-
-    def of_side(side: Array) -> list[list[Array]]:
-        # One slice each: of a slice of a slice, XLA makes a kernel.
-        turns, rows, components, *rest = side.shape
-        entries = unstack(side.reshape(turns, rows * components, *rest), 1)
-        return [entries[components * row : components * (row + 1)] for row in range(rows)]
-
-    jacobian, response = ([of_side(side) for side in sides] for sides in (matrix.jacobian, matrix.response))
-    return jacobian, response
 
 
 def normal_bound(entries: tuple[Entries, Entries], together: int, active: Array) -> Array:

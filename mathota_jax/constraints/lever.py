@@ -15,6 +15,7 @@ from mathota_jax.solver.row_matrix import Dense, RowMatrix, sum_over_points
 from mathota_jax.solver.rows import Rows, add_changes
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3, dot
 from mathota_jax.struct import pytree
@@ -124,11 +125,14 @@ class _Movement:
 
     def changes(self, impulse: Array, together: int) -> list[Array]:
         weight, found = impulse[:1], []
-        for side in self.matrix.linear_responses():
-            squared = add_slices(add_slices(side * side, 1) * (impulse * impulse), 0)
-            moved = add_slices(side * spread((impulse * self.beyond)[:, None], side.shape), 0)
-            terms = jnp.concatenate([weight, weight * self.lever, squared[None], moved])
-            found.append(sum_over_points(terms, together))
+        lever, beyond = (store(x, x) for x in (self.lever, self.beyond))
+        weights = sum_over_points(jnp.concatenate([weight, weight * lever]), together)
+        for side, factor in self.matrix.linear_responses():
+            squared = add_slices(add_slices(side * side, 1) * (impulse * impulse), 0)[None]
+            moved = add_slices(side * spread((impulse * beyond)[:, None], side.shape), 0)
+            # Of two sides with one direction computed once for both.
+            sums = compute_once([sum_over_points(x, together) for x in (squared, moved)], squared)
+            found.append(jnp.concatenate([weights, sums[0] * (factor * factor), sums[1] * factor]))
         return found
 
 

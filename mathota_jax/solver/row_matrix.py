@@ -20,6 +20,9 @@ from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.struct import pytree
 
+Entries = list[list[list[Array]]]
+"""Components (turn, column, world) of the parts of a matrix, by part and row."""
+
 
 @pytree
 class Dense:
@@ -48,9 +51,9 @@ class Dense:
         """``M^-1 J^T p`` (component, constraint, world) of each side, summed over the rows and columns of a constraint."""
         return [_sum(side, impulse, together) for side in self.response]
 
-    def linear_responses(self) -> tuple[Array, ...]:
-        """The first three components of the response of each side."""
-        return tuple(side[..., :3, :, :] for side in self.response)
+    def linear_responses(self) -> list[tuple[Array, Array | float]]:
+        """For each side the first three components of the response, and a factor (..., constraint, world) on them."""
+        return [(side[..., :3, :, :], 1.0) for side in self.response]
 
     def first_row(self) -> Dense:
         """That of the first row of each constraint alone."""
@@ -58,6 +61,11 @@ class Dense:
 
     def dense(self) -> Dense:
         return self
+
+    def entries(self) -> tuple[Entries, Entries]:
+        """Entries of two matrices whose product is ``J M^-1 J^T``; turns, no single one."""
+        jacobian, response = ([_entries(side) for side in sides] for sides in (self.jacobian, self.response))
+        return jacobian, response
 
 
 @pytree
@@ -127,12 +135,11 @@ class Points:
         """The first three components of the Jacobian of each side."""
         return tuple(self.directions * sign for sign in self._signs)
 
-    def linear_responses(self) -> tuple[Array, ...]:
+    def linear_responses(self) -> list[tuple[Array, Array | float]]:
         """As `Dense.linear_responses`."""
-        return tuple(
-            self.directions * (sign * self._of_columns(side.inverse_mass))
-            for sign, side in zip(self._signs, self.inertia, strict=True)
-        )
+        return [
+            (self.directions, sign * side.inverse_mass) for sign, side in zip(self._signs, self.inertia, strict=True)
+        ]
 
     def stored(self) -> Points:
         """The same, computed once."""
@@ -150,6 +157,24 @@ class Points:
         jacobian = compute_once(sides, self.like)
         response = tuple(self._respond(side, inertia) for side, inertia in zip(jacobian, self.inertia, strict=True))
         return Dense(jacobian, compute_once(response, self.like))
+
+    def entries(self) -> tuple[Entries, Entries]:
+        """As `Dense.entries`: the sides share what only moves them, so that it is there once, with the sum of masses."""
+        turns, rows, _, columns, worlds = self.packed.shape
+        of_rows = [list(row) for row in _entries(self.packed)]
+        mass = functools.reduce(jnp.add, [side.inverse_mass for side in self.inertia])
+        mass = self._of_columns(mass)[:, 0, 0]
+        jacobian = [[row[k : k + 3] for row in of_rows] for k in range(0, len(of_rows[0]), 3)]
+        response = [[[component * mass for component in row] for row in jacobian[0]]]
+        for side, inertia in zip(self.angular, self.inertia, strict=bool(self.angular)):
+            of_columns = jax.tree.map(lambda x: self._of_columns(x)[:, :, 0], inertia)
+            turned = of_columns.solve(Vec3(*unstack(side, 2)))
+            parts = [
+                unstack(jnp.broadcast_to(x, (turns, rows, columns, worlds)), 1)
+                for x in compute_once(turned, self.packed)
+            ]
+            response.append([list(row) for row in zip(*parts, strict=True)])
+        return jacobian, response
 
     def _respond(self, jacobian: Array, inertia: InverseInertia) -> Array:
         components = unstack(jacobian, -3)
@@ -184,7 +209,7 @@ class FirstRow:
         """As `Dense.changes`."""
         return self.whole.first_row().changes(impulse, together)
 
-    def linear_responses(self) -> tuple[Array, ...]:
+    def linear_responses(self) -> list[tuple[Array, Array | float]]:
         """As `Dense.linear_responses`."""
         return self.whole.first_row().linear_responses()
 
@@ -203,6 +228,13 @@ def _vectors(packed: Array, axis: int) -> list[Array]:
     """Triples of components."""
     axis %= packed.ndim
     return list(jax.lax.split(packed, (3,) * (packed.shape[axis] // 3), axis=axis))
+
+
+def _entries(array: Array) -> list[list[Array]]:
+    """Entries (turn, column, world) of an array by row and component; of a slice of a slice XLA would make a kernel."""
+    turns, rows, components, *rest = array.shape
+    entries = unstack(array.reshape(turns, rows * components, *rest), 1)
+    return [entries[components * row : components * (row + 1)] for row in range(rows)]
 
 
 def _first(rows: Array) -> Array:

@@ -258,7 +258,9 @@ def _add_at_filled_places(together: int, places: Places, matrix: Changes, veloci
     def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         turn, velocity = carry
         blocks, part, values = counter.row((places.blocks, matrix, impulse), turn)
-        return counter.following(turn), receive(velocity, blocks, part.changes(values, together))
+        # Stored: a kernel that reads rows of two arrays takes the scalar index that it should not (see `counter`).
+        changes = part.changes(store(values, values), together)
+        return counter.following(turn), receive(velocity, blocks, changes)
 
     return lax.fori_loop(0, places.turns, body, (counter.start(), velocity))[1]
 

@@ -16,7 +16,7 @@ from mathota_jax.collision.convex.support import SUPPORT, Parameters
 from mathota_jax.collision.polyhedron import TOPOLOGY
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm
 from mathota_jax.struct import pytree, static
 
@@ -44,7 +44,9 @@ class Difference:
         """Code of the piece pair whose difference is least along `direction` (int32, settled)."""
         code_a = SUPPORT[self.kind_a].code(self.a, direction)
         code_b = SUPPORT[self.kind_b].code(self.b, -self.rotation.apply_transposed(direction))
-        return CODES * code_a + code_b
+        # Joined as floats: the search of A would be part of the kernel of an integer sum, which does not vectorise.
+        number = direction.x.dtype
+        return settle_code(CODES * code_a.astype(number) + code_b.astype(number))
 
     def points(self, pieces: Array, direction: Vec3) -> tuple[Vec3, Vec3]:
         """Points of A and of B, in the frame of A, of a piece pair at a stored direction (A's along it, B's against it)."""
