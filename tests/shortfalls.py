@@ -15,14 +15,6 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
     "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
     "positions, whose linear systems the two modes solve by a few sweeps each",
-    **{
-        f"tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[{precision}-2.0]": "after three "
-        "exact bounces the rest of a step of 2 s is an ordinary step: in one of ten it ends 0.1 to 0.3 m above the start of "
-        "0.5 m, gate 0. A ball that leaves the plane is stopped there for the end of the step with half the step as lever, "
-        "which lifts it (a lever that ends it on the plane gains nothing); and the ball 5 m beside it, extrapolated along "
-        "the normal between them, pushes it 0.4 m into the plane (so measured with that lever)"
-        for precision in ("float32", "float64")
-    },
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
