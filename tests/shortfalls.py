@@ -8,8 +8,6 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_soft_step.py::test_boxes_on_one_point_separate[0.0]": "boxes that coincide exactly leave in one "
-    "line, each by the push-out velocity from the next: the last at 18 m/s, gate 4.5; 1e-4 apart they keep to 2.95 m/s",
     "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
     "within 10 s of steps of 1/60 s; the other solvers hold them to 7e-6 of a link, as trees that are solved exactly",
     "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
