@@ -37,7 +37,6 @@ from mathota_jax.solver.rows import (
 from mathota_jax.solver.slopes import Slopes, slopes_of
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
-from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.settle import compute_once, store, store_cotangents
 from mathota_jax.struct import pytree
 
@@ -55,11 +54,6 @@ OVER_RELAXATION = 1.7
 """Factor on the normal steps of the sweeps before those, which converge if its product with that of `normal_bound` is below
 2. Measured with 10 sweeps from nothing: ten boxes dip by 1.0 mm instead of 2.3."""
 
-FIRST_GRIP = 1.35
-"""Factor on the tangential steps of manifolds of three points and more that start without impulses. Those are bounded for
-the points turning against one another, and take a third of a common slide: a slab that is pushed slipped, in its first step,
-by 0.9 % of what would hold it, with 1.35 by 0.1 %. All contacts may not have it: friction that overshoots while its limit
-changes was measured to keep bodies creeping by mm/s. One or two points have a bound that is exact, and would swing."""
 
 LINEAR_RELAXATION = (1.5, 1.3, 1.3)
 """Factors on the steps of the normal and tangent rows of contacts in the sweeps behind a derivative, which have no bounds
@@ -104,7 +98,7 @@ def solve(
     if not rows or not iterations:
         return compute_once((velocity, impulses), velocity)
     biases = tuple(group.bias for group in rows)
-    laws = tuple(_gripping(group, impulse) for group, impulse in zip(rows, impulses, strict=True))
+    laws = tuple(group.law for group in rows)
 
     def update(number: Array | int, law: Law, bias: Array, impulse: Array, error: Array) -> Array:
         # A contact that bounces is alone for the most part, and its exact step ends at once. Longer ones leave an error
@@ -113,22 +107,6 @@ def solve(
         return law.relaxed(jnp.where(longer, OVER_RELAXATION, 1.0).astype(error.dtype)).update(impulse, error)
 
     return sweeps(iterations, rows, update, laws, biases, velocity, impulses)
-
-
-def _gripping(group: Rows, impulse: Array) -> Law:
-    """The law of a group, with longer steps of friction in manifolds that start without impulses."""
-    law, together = group.law, group.table.together
-    if not isinstance(law, Cone) or together < 3:
-        return law
-    mass = jnp.broadcast_to(law.tangent_mass, impulse[:, 0].shape)
-
-    def of_manifolds(values: Array) -> list[Array]:
-        return unstack(values.reshape(len(values), -1, together, values.shape[-1]), 2)
-
-    largest = functools.reduce(jnp.maximum, of_manifolds(impulse[:, 0]))
-    count = functools.reduce(jnp.add, [jnp.where(part > 0, 1.0, 0.0) for part in of_manifolds(mass)])
-    factor = jnp.where((largest > 0) | (count < 3), 1.0, FIRST_GRIP).astype(impulse.dtype)
-    return dataclasses.replace(law, tangent_mass=law.tangent_mass * jnp.repeat(factor, together, axis=1))
 
 
 def sweeps(
