@@ -27,7 +27,7 @@ SHORTFALLS: dict[str, str] = {
         for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
     },
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
-    + "the first of 240 steps of a box pushed by 1 % more than friction holds sticks (1/240 in dv/dF), gate 0.1 %: common slide "
+    + "the first of 240 steps of a box pushed 1 % too hard sticks (1/240 in dv/dF), gate 0.1 %: common slide "
     "decays by 0.68 a sweep; first friction steps 1.35 times as long cure it, for 3 to 4 % of the rate of a sliding cube",
     "tests/gradients/test_bystanders.py::test_stick_and_slip[float64]": SWEEPS
     + "the same: dv/dF and dv/dmu of a slipping box are 0.41 % off, gate 0.1 %",
