@@ -85,15 +85,12 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     problem = constrain(model, state, bodies, blocks, inertia, free, None, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
     now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
-    foreseen, bounces = collisions.foreseen(whole, problem, now, packed, gravity(model), left)
+    foreseen, bounces = collisions.foreseen(whole, problem, bodies, now, packed, gravity(model), left)
     split = bounces & ~last & ~progress.ended
     # Rows would hold together what has just rebounded and is still near.
-    dropped = tuple((apart & split) | clear for apart, clear in foreseen)
-    contact_rows = [
-        group._replace(rows=collisions.without(group.rows, none))
-        for group, none in zip(problem.contact_rows, dropped, strict=True)
-    ]
-    problem = problem._replace(contact_rows=contact_rows)
+    counting = [collisions.corrected(*one, split) for one in zip(problem.contact_rows, foreseen, strict=True)]
+    problem = problem._replace(contact_rows=[group for group, _ in counting])
+    dropped = [none for _, none in counting]
     start, _ = starting_impulses(model, state, problem, inertia, packed)
     joint_count = len(problem.joint_rows)
     start = start[:joint_count] + tuple(

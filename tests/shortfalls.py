@@ -8,21 +8,11 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_soft_step.py::test_boxes_on_one_point_separate[0.0]": "boxes that coincide exactly leave in one "
-    "line, each by the push-out velocity from the next: the last at 18 m/s, gate 4.5; 1e-4 apart they keep to 2.95 m/s",
     "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
     "within 10 s of steps of 1/60 s; the other solvers hold them to 7e-6 of a link, as trees that are solved exactly",
     "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
     "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
     "positions, whose linear systems the two modes solve by a few sweeps each",
-    **{
-        f"tests/physics/test_impact_events.py::test_more_bounces_than_events_lose_nothing[{precision}-2.0]": "after three "
-        "exact bounces the rest of a step of 2 s is an ordinary step: in one of ten it ends 0.1 to 0.3 m above the start of "
-        "0.5 m, gate 0. A ball that leaves the plane is stopped there for the end of the step with half the step as lever, "
-        "which lifts it (a lever that ends it on the plane gains nothing); and the ball 5 m beside it, extrapolated along "
-        "the normal between them, pushes it 0.4 m into the plane (so measured with that lever)"
-        for precision in ("float32", "float64")
-    },
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
@@ -37,9 +27,10 @@ SHORTFALLS: dict[str, str] = {
         for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
     },
     "tests/gradients/test_stick_slip.py::test_both_sides_of_the_threshold[float64]": SWEEPS
-    + "dv/dF of a slipping box is 0.36 % off, gate 0.1 %",
+    + "the first of 240 steps of a box pushed 1 % too hard sticks (1/240 in dv/dF), gate 0.1 %: common slide "
+    "decays by 0.68 a sweep; first friction steps 1.35 times as long cure it, for 3 to 4 % of the rate of a sliding cube",
     "tests/gradients/test_bystanders.py::test_stick_and_slip[float64]": SWEEPS
-    + "dv/dF and dv/dmu of a slipping box are 0.41 % off, gate 0.1 %",
+    + "the same: dv/dF and dv/dmu of a slipping box are 0.41 % off, gate 0.1 %",
     "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[sweeps]": "two joints left to 10 sweeps (as "
     "beside contacts), rods with 5000 times less inertia about one axis: not finite, with 40 sweeps either; 200 hold "
     "(energy never gained), one rod alone holds with 10",

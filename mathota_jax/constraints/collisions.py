@@ -10,13 +10,14 @@ Simultaneous Impact", ACM Trans. Graph. 31(4), 2012: generalized reflections).
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, moving_inertia, smaller_moving, unpack_blocks
-from mathota_jax.collision.narrowphase import ContactSet, find_contacts
+from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet, find_contacts
 from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
 from mathota_jax.constraints import contact, joint
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
@@ -26,6 +27,7 @@ from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
+from mathota_jax.constraints.swept import misses
 from mathota_jax.model import Model
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
@@ -33,6 +35,7 @@ from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, matrix_velocity, row_velocity
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
 
@@ -42,32 +45,51 @@ ROUNDS = 16
 Impulses = tuple[Array, ...]
 
 
+class Foreseen(NamedTuple):
+    """What contacts of one group will do until the end of a step if nothing stops them, (turn, 1, column, world).
+
+    Attributes:
+      apart: what a step that is split leaves to the search, since it meets at speed or is apart.
+      clear: what no contact row should touch: it parts at speed and does not meet again, or flies past.
+      returns: what touches, leaves at speed and meets again.
+      target, lever: for those that return, the velocity to reach in the end [m/s] and the lever of the impulse [s].
+    """
+
+    apart: Array
+    clear: Array
+    returns: Array
+    target: Array
+    lever: Array
+
+
 def foreseen(
-    model: Model, problem: Problem, now: Array, then: Array, gravity: Vec3, left: Array
-) -> tuple[tuple[tuple[Array, Array], ...], Array]:
-    """The contacts that will meet at speed within the time `left` if nothing stops them, and those that will not.
+    model: Model, problem: Problem, bodies: Bodies, now: Array, then: Array, gravity: Vec3, left: Array
+) -> tuple[tuple[Foreseen, ...], Array]:
+    """What the contacts will do within the time `left` if nothing stops them.
 
     Args:
       model: parameters, `dt` being the whole time step, and static scene.
       problem: of the time that is left.
+      bodies: all of them.
       now, then: (component, block, world) velocities now and after that time without constraints.
       gravity: components (1, world).
       left: (world,) time [s].
 
     Returns:
-      For each group of contact rows, (turn, 1, column, world): what a step that is split leaves to the search, since it
-      meets at speed or is apart; what parts at speed and does not meet again. (world,) whether any that bounces meets.
+      For each group of contact rows; and (world,) whether any contact that bounces meets at speed.
     """
     found, worlds = [], now.shape[-1]
     bounces = jnp.zeros(worlds, bool)
     pull, left = norm(gravity), left[None]
-    fixed = lax.stop_gradient((model, problem.contact_rows, now, then, pull, left))
-    model, groups, now, then, pull, left = fixed
-    for group in groups:
+    exact = (model, problem.contact_rows, now, then, left)
+    fixed = lax.stop_gradient((model, problem.contact_rows, bodies, now, then, pull, left))
+    model, groups, bodies, now, then, pull, left = fixed
+    past = misses(model, bodies, now, then, left).astype(now.dtype) if model.scene.slot_count else None
+    for group, exact_group in zip(groups, exact[1], strict=True):
         rows = group.rows
         if isinstance(rows.table, TracedTable):
             none = jnp.zeros((*rows.bias.shape[:1], 1, *rows.bias.shape[2:]), bool)
-            found.append((none, none))
+            found.append(Foreseen(none, none, none, group.lever, group.lever))
             continue
 
         start, free = (first_row_velocity(rows, v) for v in (now, then))
@@ -82,10 +104,46 @@ def foreseen(
         followed = ~reaches & (group.separation > TOUCHING * group.size)
         meets = settle(jnp.where(fast & reaches, 1.0, 0.0)) > 0.5
         followed = settle(jnp.where(followed, 1.0, 0.0)) > 0.5
-        clear = settle(jnp.where(fast & (start > 0) & (time > left), 1.0, 0.0)) > 0.5
-        found.append((meets | followed, clear))
+        flies_past = (pack_scalars(rows.table, [select(rows.table, past)], worlds) > 0.5) & (
+            group.separation > SPECULATIVE * group.size
+        )
+        clear = settle(jnp.where((fast & (start > 0) & (time > left)) | flies_past, 1.0, 0.0)) > 0.5
+        found.append(Foreseen(meets | followed, clear, *_return(exact[0], exact_group, *exact[2:], fast)))
         bounces = bounces | (meets & (e > 0)).any((0, 1, 2))
     return tuple(found), bounces
+
+
+def _return(
+    model: Model, group: ContactRows, now: Array, then: Array, left: Array, fast: Array
+) -> tuple[Array, Array, Array]:
+    """Which contacts touch, leave at speed and come back, the velocity to reach, and the lever of the impulse.
+
+    They rebound once more if they are in flight at the end. Else they end where they touched: their own impacts are over by
+    then, or too many to follow.
+    """
+    start, free = (first_row_velocity(group.rows, v) for v in (now, then))
+    acceleration = (free - start) / left
+    comes_back = fast & (group.separation <= 0) & (start > 0) & (start + free < 0)
+    time = jnp.where(comes_back, -2.0 * start / jnp.where(comes_back, acceleration, 1.0), 0.0)
+    velocity = _restitution(model, group.rows, now.shape[-1]) * start + acceleration * (left - time)
+    rebounds = comes_back & (velocity > 0)
+    lever = jnp.where(rebounds, left - time, 0.5 * left * (1.0 + start / jnp.where(comes_back, free, -1.0)))
+    chosen = settle(jnp.where(comes_back, 1.0, 0.0) + jnp.where(rebounds, 1.0, 0.0))
+    return chosen > 0.5, jnp.where(chosen > 1.5, velocity, 0.0), lever
+
+
+def corrected(group: ContactRows, found: Foreseen, split: Array) -> tuple[ContactRows, Array]:
+    """Rows of the contacts that count in this part of a step, and which do not; `split` (world,) if an impact ends it."""
+    dropped = (found.apart & split) | found.clear
+    returns = found.returns & ~split
+    bias = group.rows.bias
+    first = jnp.where(returns, -found.target, bias[:, :1])
+    rows = dataclasses.replace(group.rows, bias=jnp.concatenate([first, bias[:, 1:]], axis=1))
+    lever = jnp.where(returns, found.lever, group.lever)
+    falling = group.falling
+    if falling is not None:
+        falling = falling * safe_divide(lever, group.lever)
+    return group._replace(rows=without(rows, dropped), lever=lever, falling=falling), dropped
 
 
 def _restitution(model: Model, rows: Rows, worlds: int) -> Array:
