@@ -92,14 +92,16 @@ def materialize(values: Any) -> Any:
 
     `compute_once` can not help where a single consumer is the problem: a concatenation of long expressions is compiled
     to one kernel that branches for every element. A conditional is never fused. Its predicate is true, since no square is
-    2 or 3 modulo 4; its other branch returns every array in the place of another, or JAX would forward them unstored.
+    2 or 3 modulo 4; its other branch returns every array in the place of another, or the negative of a single one, or JAX
+    would forward them unstored.
 
     Args:
-        values: Pytree of at least two finite arrays, all of the same shape but for the number of worlds.
+        values: Pytree of finite arrays, all of the same shape but for the number of worlds.
     """
     leaves, tree = jax.tree.flatten(values)
     leaves = jnp.broadcast_arrays(*leaves)
     bits = lax.bitcast_convert_type(leaves[0].reshape(-1)[0].astype(jnp.float32), jnp.int32)
     always = ((bits * bits) & 3) < 2
-    stored = lax.cond(always, lambda *x: x, lambda first, *rest: (*rest, first), *leaves)
+    other = (lambda first, *rest: (*rest, first)) if len(leaves) > 1 else (lambda first: (-first,))
+    stored = lax.cond(always, lambda *x: x, other, *leaves)
     return jax.tree.unflatten(tree, stored)
