@@ -328,8 +328,8 @@ SCENES = {
         ),
         Scene(
             "stack10", "sink or sideways motion of ten stacked cubes of 0.2 m after 5 s", "mm", 200.0, "stack",
-            boxes((1.0,) * 10, 0.5), 5.0, _standing, Target(1e5, 0.2), finest=1 / 240, worlds=1, batches=(64, 128),
-            capacity=16, settings=(*OURS, TIGHT, TIGHT_QUICK),
+            boxes((1.0,) * 10, 0.5), 5.0, _standing, Target(1e5, 0.2), finest=1 / 240, worlds=1, batches=(128, 192),
+            capacity=9, settings=(*OURS, TIGHT, TIGHT_QUICK),
             tuned=STIFF, peers=("PyBullet",),
         ),
         Scene(
