@@ -237,3 +237,17 @@ def test_size_of_a_shape_is_traced():
         builder.add_body(Sphere(radius), mass=1.0, position=(0, 1, 0))
         compiled(*builder.build(undamped()))
     assert len(traces) == 1
+
+
+def test_nothing_long_is_worked_out_element_by_element():
+    """A kernel that joins arrays branches for each element and runs side by side for no two worlds: it has to be short."""
+    builder = SceneBuilder()
+    builder.add_body(Box((0.1, 0.2, 0.3)), mass=1.0)
+    model, state = builder.build(undamped())
+    worlds = jax.tree.map(lambda x: jnp.broadcast_to(x, (64, *x.shape)), state)
+    program = jax.jit(jax.vmap(step, in_axes=(None, 0))).lower(model, worlds).compile().as_text()
+    joining = [
+        kernel for kernel in program.split("\n\n") if "fused_computation" in kernel and " concatenate(" in kernel
+    ]
+    assert joining
+    assert max(kernel.count("\n") for kernel in joining) < 100  # 276 where the angular velocity was not stored first

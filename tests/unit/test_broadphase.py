@@ -1,5 +1,7 @@
 """Broadphase methods against brute force in NumPy: the same set of pairs, whatever the scene."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -123,6 +125,25 @@ def test_pairs_are_those_of_brute_force(method, scene, precision):
         assert int(pairs.count[world]) == len(expected[world])
     assert not np.any(pairs.overflow)
     assert not np.any(pairs.invalid)
+
+
+@pytest.mark.parametrize("chunk", [1, 200, 10**6])
+@pytest.mark.parametrize("order", ["static first", "static last", "mixed", "one moves"])
+def test_all_pairs_in_chunks_of_any_size(chunk, order, monkeypatch, precision):
+    monkeypatch.setattr(importlib.import_module("mathota_jax.collision.broadphase.all_pairs"), "CHUNK", chunk)
+    rng = np.random.default_rng(5)
+    static = {
+        "static first": np.arange(40) < 15,
+        "static last": np.arange(40) >= 25,
+        "mixed": rng.random(40) < 0.4,
+        "one moves": np.arange(40) != 17,
+    }[order]
+    admissible = Admissible(tuple(range(40)), tuple(static.tolist()), ((16, 17), (17, 30)))
+    bounds = bounds_of(*cloud(rng, 40, 0.2), precision)
+    pairs = candidate_pairs("all_pairs", bounds, admissible, 780)
+    for world, expected in enumerate(brute_force(bounds, admissible)):
+        assert expected
+        assert listed(pairs, world) == sorted(expected)
 
 
 def test_scenes_are_neither_empty_nor_full():

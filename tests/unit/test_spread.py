@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from mathota_jax.spatial.spread import FEW_SLICES, add_all_slices, add_slices, largest_slice, spread
+from mathota_jax.spatial.spread import FEW_SLICES, add_all_slices, add_slices, greatest, largest_slice, least, spread
 
 
 def product(matrix, vector):
@@ -42,9 +42,16 @@ def test_transposes_have_no_reduction(float64):
     assert "add_slices" in cotangents
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 5), (2, 3, 4, 5), (FEW_SLICES, 2, 5)], ids=["one", "few", "many"])
+@pytest.mark.parametrize("shape", [(1, 1, 5), (2, 3, 4, 5), (FEW_SLICES, 2, 5), (3, FEW_SLICES + 1, 5)], ids=str)
 def test_sum_and_maximum_over_all_but_the_worlds(float64, shape):
     values = jnp.asarray(np.random.default_rng(0).normal(size=shape))
     every_axis = tuple(range(len(shape) - 1))
     np.testing.assert_allclose(add_all_slices(values), np.asarray(values).sum(every_axis), rtol=1e-13)
     np.testing.assert_array_equal(largest_slice(values), np.asarray(values).max(every_axis))
+
+
+@pytest.mark.parametrize("count", [1, 7, FEW_SLICES + 1])
+def test_extremes_along_the_leading_axis(float64, count):
+    values = np.random.default_rng(1).normal(size=(count, 2, 5))
+    np.testing.assert_array_equal(greatest(jnp.asarray(values)), values.max(0))
+    np.testing.assert_array_equal(least(jnp.asarray(values)), values.min(0))

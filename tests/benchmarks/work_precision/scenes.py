@@ -359,7 +359,7 @@ SCENES = {
         Scene(
             "hulls8", "largest penetration of 8 hulls of 0.24 m at rest on a plane", "mm", 240.0, "pile",
             hulls(), 3.0, _resting_overlap("hulls8"), Target(6e4, 8.0), finest=1 / 240, worlds=1, frames=12,
-            batches=(64, 128), capacity=16, settings=(*OF_PILES, TIGHT, TIGHT_QUICK), tuned=STIFF, peers=("PyBullet",),
+            batches=(64, 128), capacity=9, settings=(*OF_PILES, TIGHT, TIGHT_QUICK), tuned=STIFF, peers=("PyBullet",),
         ),
     )
 }  # fmt: skip
