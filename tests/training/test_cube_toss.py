@@ -112,18 +112,22 @@ def thrown(known, frames=50, count=6):
 
 
 def test_whole_motions_show_friction_restitution_and_inertia(gate):
-    """Six tosses of a third of a second; of the corners, which they hardly tell, they leave 0.3 mm open."""
+    """Six tosses of a third of a second, of which the fit first sees 0.14 s.
+
+    Whole tosses alone end in one of many local minima, which one depends on round-off: inertia 0.2 to 2.3 % off.
+    """
     known = FITTED[SETTINGS[0]]
     tosses, start = thrown(known)
     away = {"friction": 1.05, "restitution": 0.9, "inertia": np.asarray([0.97, 1.04, 1.03]), "corner_radius": 1.2}
     begin = known._replace(**{name: np.asarray(getattr(known, name)) * away[name] for name in NAMES})
-    found = refine(tosses, start, begin, horizon=50, steps=40)
+    found = refine(tosses, start, begin, horizon=20, steps=40)
+    found = refine(tosses, start, found, horizon=50, steps=40)
     position, rotation = prediction_errors(tosses, start, found, 50)
-    gate("position [% of width], 3.0 at first", position.mean(), 0.5)
-    gate("rotation [degree], 1.6 at first", rotation.mean(), 0.5)
-    for name, limit in {"friction": 0.01, "restitution": 0.02, "inertia": 0.02}.items():
-        gate(f"{name} / truth - 1", np.asarray(getattr(found, name)) / getattr(known, name) - 1, limit)
-    gate("corner radius - truth [m]", found.corner_radius - known.corner_radius, 5e-4)
+    gate("position [% of width], 3.0 at first", position.mean(), 0.05)
+    gate("rotation [degree], 1.6 at first", rotation.mean(), 0.1)
+    for name in ("friction", "restitution", "inertia"):
+        gate(f"{name} / truth - 1", np.asarray(getattr(found, name)) / getattr(known, name) - 1, 1e-3)
+    gate("corner radius - truth [m]", found.corner_radius - known.corner_radius, 1e-5)
 
 
 def test_missing_and_bad_files(tmp_path, capsys):
