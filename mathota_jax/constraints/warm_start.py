@@ -80,17 +80,12 @@ def plausible(
     if turning is not None and angular is not None:
         spin = inertia.apply(angular)
         slope, curvature = slope + dot(turning, spin), curvature + dot(angular, spin)
-    slope, curvature = _total(slope), _total(curvature)
+    slope, curvature = add_all_slices(slope), add_all_slices(curvature)
     for group, impulse in zip(rows, start, strict=True):
-        slope = slope + _total(group.bias * impulse)
+        slope = slope + add_all_slices(group.bias * impulse)
     # Stored: every impulse needs their sum over all bodies.
     slope, curvature = compute_once((slope, curvature), velocity)
     worse = slope + 0.5 * curvature > 0
     scale = jnp.where(worse, jnp.clip(safe_divide(-slope, curvature), 0.0, 1.0), 1.0)
     # The start does not move the solution.
     return lax.stop_gradient((tuple(impulse * scale for impulse in start), change * scale))
-
-
-def _total(terms: Array) -> Array:
-    """Sum (world,) of finite terms (..., world), each computed once."""
-    return add_all_slices(compute_once(terms, terms))

@@ -31,9 +31,9 @@ def solve_once(rows: tuple[Rows, ...], by_error: tuple[Array, ...], right_side: 
     The right side is one more column of the matrix, which elimination permutes and reduces with the others: to turn pivots
     into a permutation takes longer than to eliminate.
     """
-    system = _system(rows, by_error, right_side.shape[0]).transpose(2, 1, 0)
-    columns = jnp.concatenate([system, right_side.transpose(1, 0, 2).reshape(1, len(system), -1)])
-    # Stored: within the kernel that makes it, a transposition reads one number at a time.
+    parts = _system(rows, by_error, right_side.shape[0]), _vectors(right_side)
+    # Joined with the worlds last, and stored: within the kernel that makes it, a transposition reads one number at a time.
+    columns = jnp.concatenate([part.transpose(2, 1, 0) for part in parts])
     lu = lax.linalg.lu(materialize(columns).transpose(2, 1, 0))[0]
     return _velocity(lax.linalg.triangular_solve(lu[..., :-1], lu[..., -1:], left_side=True, lower=False), right_side)
 

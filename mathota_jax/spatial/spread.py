@@ -44,12 +44,13 @@ def add_slices(array: Array, axis: int) -> Array:
 
 
 def add_all_slices(array: Array) -> Array:
-    """Sum (world,) of finite numbers along all axes but the last."""
+    """Sum (world,) of finite numbers, each computed once, along all axes but the last."""
+    array = store(array, array)
     if array.size <= FEW_SLICES * array.shape[-1]:
         return add_slices(array.reshape(-1, array.shape[-1]), 0)
     while array.ndim > 1:
-        array = store(array, array)
         array = add_slices(array, 0) if len(array) <= FEW_SLICES else array.sum(0)
+        array = store(array, array)
     return array
 
 
