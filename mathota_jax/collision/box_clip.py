@@ -23,6 +23,7 @@ from jax import Array, lax
 from mathota_jax.collision.box_frame import BoxFrame
 from mathota_jax.collision.closest import clamp
 from mathota_jax.spatial.settle import compute_once, settle_code
+from mathota_jax.spatial.spread import for_each
 from mathota_jax.spatial.vector import Vec3
 
 RECTANGLE_TOLERANCE = 1e-3
@@ -82,7 +83,7 @@ def clip_incident_face(frame: BoxFrame, size: Array) -> ClipPoint:
     face = compute_once(face, frame.incident_axis)
     packed = _search(lax.stop_gradient(face), frame.edge, size)
     shifts = (CODE_BITS * np.arange(4, dtype=np.int32)).reshape((4,) + (1,) * packed.ndim)
-    return _point(face, ((packed >> shifts) & (2**CODE_BITS - 1)) - 1)
+    return _point(for_each(4, face), ((packed >> shifts) & (2**CODE_BITS - 1)) - 1)
 
 
 def _search(face: _Face, edge: Array, size: Array) -> Array:
@@ -215,7 +216,7 @@ def code_parts(code: Array) -> CodeParts:
 
 
 def _point(face: _Face, code: Array) -> ClipPoint:
-    """The points with the given codes (point, pair, world), differentiable."""
+    """The points with the given codes (point, pair, world) on faces with those axes, differentiable."""
     parts = code_parts(code)
     number = face.center.x.dtype
     first = jnp.where(parts.first_positive, 1.0, -1.0).astype(number)

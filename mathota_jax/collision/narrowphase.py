@@ -13,6 +13,7 @@ from mathota_jax.collision.placement import shape_parameters, shape_poses
 from mathota_jax.scene import PairGroup, Scene
 from mathota_jax.spatial.quaternion import Quaternion
 from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import spread
 from mathota_jax.spatial.vector import Vec3
 
 SPECULATIVE = 0.5
@@ -104,7 +105,7 @@ def flatten(manifold: Manifold, pair_count: int) -> ContactSet:
 
     def per_pair(value: Array) -> Array:
         # A normal that all worlds share (that of a plane) keeps its single world.
-        full = jnp.broadcast_to(value[:, None], (pair_count, len(points), value.shape[-1]))
+        full = spread(value[:, None], (pair_count, len(points), value.shape[-1]))
         return full.reshape(pair_count * len(points), value.shape[-1])
 
     def per_axis(vectors: list[Vec3]) -> Vec3:

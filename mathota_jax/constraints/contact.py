@@ -40,7 +40,7 @@ from mathota_jax.solver.table import Constraint, Table, TracedTable, make_tables
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.settle import compute_once, settle, store_cotangents
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
 
@@ -338,7 +338,8 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
         separation, slop, size = levels
         # The change is of first order in the turn. For a body that turns by a radian and more it says little, and never
         # that the overlap went beyond the body's middle.
-        error = jnp.maximum(separation + row_velocity(part, displacement), jnp.minimum(separation, -size)) + slop
+        change = store_cotangents(row_velocity(part, displacement))
+        error = jnp.maximum(separation + change, jnp.minimum(separation, -size)) + slop
         return jnp.where(error < 0, percent * error, error)
 
     firsts = dataclasses.replace(rows, matrix=first, law=_push_only(normal_mass(rows)))
@@ -389,12 +390,13 @@ def slot_force(contacts: list[ContactRows], impulses: list[Array], slot_count: i
 def _force_of_columns(contact: ContactRows, impulse: Array) -> Vec3:
     """Impulses as vectors, components (turn, column, world)."""
     turns, _, columns, worlds = impulse.shape
+    rows = unstack(impulse, 1)
     components = []
     for axis in range(3):
         total = jnp.zeros((turns, columns, worlds), impulse.dtype)
-        for row, direction in enumerate(contact.directions):
+        for part, direction in zip(rows, contact.directions, strict=True):
             full = jnp.broadcast_to(direction[axis], (turns * columns, worlds)).reshape(turns, columns, worlds)
-            total = total + full * impulse[:, row]
+            total = total + full * part
         components.append(total)
     return Vec3(*components)
 

@@ -42,7 +42,8 @@ def normal_bound(entries: tuple[Entries, Entries], together: int, active: Array)
     rank = jnp.clip(add_slices(points, 2), 1.0, 3.0)
     bound = (trace + safe_sqrt(jnp.maximum((rank - 1.0) * (rank * norm - trace * trace), 0.0))) / rank
     bound = bound / jnp.where(rank > 2.0, NORMAL_RELAXATION, 1.0)
-    return compute_once(jnp.repeat(bound, together, axis=1), active)
+    # Repeated after it is stored: XLA turns a division by what is repeated into a product, which it copies.
+    return jnp.repeat(compute_once(bound, active), together, axis=1)
 
 
 def tangent_bound(entries: tuple[Entries, Entries], together: int, active: Array) -> Array:

@@ -126,13 +126,15 @@ class _Movement:
     def changes(self, impulse: Array, together: int) -> list[Array]:
         weight, found = impulse[:1], []
         lever, beyond = (store(x, x) for x in (self.lever, self.beyond))
+        displaced = impulse * spread(beyond, impulse.shape)
         weights = sum_over_points(jnp.concatenate([weight, weight * lever]), together)
         for side, factor in self.matrix.linear_responses():
             squared = add_slices(add_slices(side * side, 1) * (impulse * impulse), 0)[None]
-            moved = add_slices(side * spread((impulse * beyond)[:, None], side.shape), 0)
+            moved = add_slices(side * spread(displaced[:, None], side.shape), 0)
             # Of two sides with one direction computed once for both.
             sums = compute_once([sum_over_points(x, together) for x in (squared, moved)], squared)
-            found.append(jnp.concatenate([weights, sums[0] * (factor * factor), sums[1] * factor]))
+            factors = spread(factor[None], sums[1].shape) if isinstance(factor, Array) else factor
+            found.append(jnp.concatenate([weights, sums[0] * (factor * factor), sums[1] * factors]))
         return found
 
 

@@ -39,8 +39,15 @@ class Bounded:
 
     def update(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
-        free = impulse - (error + self.softness * impulse) * self.effective_mass
-        return jnp.clip(free, self.lower, self.upper)
+        return self.within_bounds(self.free(impulse, error))
+
+    def free(self, impulse: Array, error: Array) -> Array:
+        """New accumulated impulse if there were no bounds."""
+        return impulse - (error + self.softness * impulse) * self.effective_mass
+
+    def within_bounds(self, impulse: Array) -> Array:
+        """The nearest impulse that is allowed."""
+        return jnp.clip(impulse, self.lower, self.upper)
 
 
 @pytree

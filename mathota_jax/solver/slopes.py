@@ -94,11 +94,10 @@ Slopes = BoundedSlopes | ConeSlopes
 def slopes_of(law: Law, impulse: Array, error: Array) -> Slopes:
     """Those of a law of a whole table at its fixed point, stored."""
     if isinstance(law, Bounded):
-        one, zero = jnp.ones_like(impulse), jnp.zeros_like(impulse)
-        by_impulse, by_error = (
-            jax.jvp(law.update, (impulse, error), change)[1] for change in ((one, zero), (zero, one))
-        )
-        return compute_once(BoundedSlopes(by_impulse, by_error), impulse)
+        free = law.free(impulse, error)
+        inside = jax.jvp(law.within_bounds, (free,), (jnp.ones_like(free),))[1]
+        softened = inside * law.effective_mass
+        return compute_once(BoundedSlopes(inside - softened * law.softness, -softened), impulse)
     return compute_once(_of_cone(law, impulse, error), impulse)
 
 

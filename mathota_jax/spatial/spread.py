@@ -36,6 +36,11 @@ def spread(array: Array, shape: tuple[int, ...]) -> Array:
     return array if array.shape == shape else _spread_p.bind(array, shape=shape)
 
 
+def for_each(count: int, tree: Any) -> Any:
+    """Every array (..., world) of a pytree `count` times, on a new leading axis."""
+    return jax.tree.map(lambda x: spread(x[None], (count, *x.shape)), tree)
+
+
 def add_slices(array: Array, axis: int) -> Array:
     """Sum along a short axis, which is removed."""
     axis %= array.ndim

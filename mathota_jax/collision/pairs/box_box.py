@@ -16,6 +16,7 @@ from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import compute_once, settle, settle_code
+from mathota_jax.spatial.spread import for_each
 from mathota_jax.spatial.vector import Vec3, dot, where
 
 EDGE_PAIR = 16
@@ -73,18 +74,19 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     # All four slots at once: as four expressions they would be compiled four times.
     in_first = jnp.asarray(np.arange(4) == 0).reshape(4, 1, 1)
     from_clip = on_face | ~in_first
-    middle = Vec3(clipped.u, clipped.v, frame.half.z + 0.5 * clipped.w)
     closest = jnp.where(on_closest, apart.separation, apart.depth)
     other_middle = where(on_edge, crossing.middle, apart.middle)
     other_separation = jnp.where(on_edge, crossing.separation, closest)
     other_middle, other_separation = compute_once((other_middle, other_separation), other_separation)
-    middle = where(from_clip, middle, other_middle)
+    of_pair = (frame.basis, frame.origin, frame.half.z, other_middle, other_separation)
+    basis, origin, height, other_middle, other_separation = for_each(4, of_pair)
+    middle = where(from_clip, Vec3(clipped.u, clipped.v, height + 0.5 * clipped.w), other_middle)
     separation = jnp.where(from_clip, clipped.w, other_separation)
     otherwise = jnp.where(on_edge, crossing.feature, CLOSEST_POINTS)
     feature = jnp.where(from_clip, _clip_feature(frame, clipped), otherwise)
     active = in_first | ((clipped.code >= 0) & on_face)
     normal_w = compute_once(normal_w, separation)
-    slots = compute_once((*(frame.origin + frame.basis.apply(middle)), separation), separation)
+    slots = compute_once((*(origin + basis.apply(middle)), separation), separation)
     x, y, z, separation = (unstack(values, 0) for values in slots)
     fields = zip(x, y, z, separation, strict=True)
     points = [ContactPoint(Vec3(*p), gap, feature[k], active[k]) for k, (*p, gap) in enumerate(fields)]
