@@ -29,7 +29,7 @@ from mathota_jax.constraints.assembly import (
     smaller_side,
     turn_of_points,
 )
-from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
+from mathota_jax.constraints.effective_mass import first_grip, normal_bound, tangent_bound
 from mathota_jax.constraints.impact import Approach, impact, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -177,6 +177,7 @@ def contact_rows(
             normal_mass=mass,
             tangent_mass=safe_divide(active, tangent_bound(entries, table.together, active)),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
+            first_grip=first_grip(table.together, active) if scene.options.solver == "pgs" else None,
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:

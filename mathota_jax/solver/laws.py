@@ -33,6 +33,10 @@ class Bounded:
     lower: Array
     upper: Array
 
+    def starting(self, impulse: Array) -> Bounded:
+        """The same law, whatever the sweeps start from."""
+        return self
+
     def relaxed(self, factor: Array) -> Bounded:
         """The same law, whatever the factor: joints that overshoot were measured to feed a swinging arm with energy."""
         return self
@@ -70,11 +74,20 @@ class Cone:
       normal_mass: effective mass of the normal row.
       tangent_mass: common effective mass of the tangent rows.
       friction: Coulomb coefficient.
+      first_grip: factor on the tangential steps of contacts that start without an impulse; None for 1.
     """
 
     normal_mass: Array
     tangent_mass: Array
     friction: Array
+    first_grip: Array | None = None
+
+    def starting(self, impulse: Array) -> Cone:
+        """The same law for sweeps from given impulses (turn, row, column, world)."""
+        if self.first_grip is None:
+            return self
+        longer = jnp.where(impulse[:, 0] > 0, 1.0, self.first_grip)
+        return Cone(self.normal_mass, self.tangent_mass * longer, self.friction)
 
     def relaxed(self, factor: Array) -> Cone:
         """The same law with longer steps of the normal row, which do not move its fixed point; `factor` (column, world).

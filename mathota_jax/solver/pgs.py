@@ -54,7 +54,6 @@ OVER_RELAXATION = 1.7
 """Factor on the normal steps of the sweeps before those, which converge if its product with that of `normal_bound` is below
 2. Measured with 10 sweeps from nothing: ten boxes dip by 1.0 mm instead of 2.3."""
 
-
 LINEAR_RELAXATION = (1.5, 1.3, 1.3)
 """Factors on the steps of the normal and tangent rows of contacts in the sweeps behind a derivative, which have no bounds
 that could make them swing."""
@@ -98,7 +97,7 @@ def solve(
     if not rows or not iterations:
         return compute_once((velocity, impulses), velocity)
     biases = tuple(group.bias for group in rows)
-    laws = tuple(group.law for group in rows)
+    laws = tuple(group.law.starting(impulse) for group, impulse in zip(rows, impulses, strict=True))
 
     def update(number: Array | int, law: Law, bias: Array, impulse: Array, error: Array) -> Array:
         # A contact that bounces is alone for the most part, and its exact step ends at once. Longer ones leave an error
