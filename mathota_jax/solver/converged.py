@@ -60,7 +60,9 @@ SLOW = 0.5
 PATIENCE = 4
 """Slow outer steps in a row after which a residual that is acceptable is accepted: the stiffness grew at each."""
 
-FIRST_STIFFNESS, STIFFNESS_FACTOR = 10.0, 4.0
+FIRST_STIFFNESS, STIFFNESS_FACTOR, EASY_FACTOR = 10.0, 4.0, 10.0
+"""The stiffness grows faster after an outer step that took a single Newton step."""
+
 LARGEST_STIFFNESS = {"float32": 1e5, "float64": 1e9}
 """The linear system loses the mass of a body beside a stiffness near the inverse of round-off."""
 
@@ -221,7 +223,8 @@ class _Problem:
         outer = gives_up | (inner <= INEXACT * search.residual) | (inner <= self.tolerance)
         slow = outer & (residual > SLOW * search.residual)
         harder = outer & ~gives_up & (slow | (search.newton == 0))
-        stiffness = jnp.where(harder, search.stiffness * STIFFNESS_FACTOR, search.stiffness)
+        factor = jnp.where(search.newton == 0, EASY_FACTOR, STIFFNESS_FACTOR)
+        stiffness = jnp.where(harder, search.stiffness * factor, search.stiffness)
         stiffness = jnp.where(gives_up, search.stiffness / STIFFNESS_FACTOR, stiffness)
         slow_steps = jnp.where(outer, jnp.where(slow, search.slow + 1, 0), search.slow)
         better = residual < search.least
