@@ -7,7 +7,10 @@ in the velocities: a linear system of the size of the moving bodies, however man
 where rows are redundant. A search along the step compares kinetic energies of the residual. The stiffness grows while
 all goes well and falls when Newton's method fails.
 
-Residuals are velocities times the root of each row's effective mass, so that units and sizes do not matter.
+Impulses are searched as changes of the centre of the proximal term, and velocities by increments. A light body under a heavy
+one carries impulses whose round-off alone would move it, so nothing that decides when a world is solved may contain them.
+Residuals are velocities, beside the largest one of contacts and, weighed by the root of each row's effective mass, beside
+that of the largest energy: the energy alone would let a light body under a heavy one move.
 
 Sources: R. T. Rockafellar, "Augmented Lagrangians and applications of the proximal point algorithm in convex
 programming", Math. Oper. Res. 1, 1976; P. Alart and A. Curnier, "A mixed formulation for frictional contact problems prone
@@ -27,6 +30,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import implicit, velocity_system
+from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.pgs import linearise
 from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.solver.row_matrix import Dense
@@ -38,10 +42,10 @@ from mathota_jax.spatial.spread import add_all_slices, add_slices, largest_slice
 LIMIT = 150
 """Largest number of linear systems in a solve. Measured: ten boxes at rest take 1 or 2, a falling pile 20."""
 
-NEWTON_LIMIT = 8
+NEWTON_LIMIT = 5
 """Newton steps without success after which the problem is made softer."""
 
-TRIALS = 5
+TRIALS = 8
 """Step lengths 1, 1/2, 1/4, ... of the search along a Newton step."""
 
 ENOUGH = 0.8
@@ -56,9 +60,15 @@ SLOW = 0.5
 PATIENCE = 4
 """Slow outer steps in a row after which a residual that is acceptable is accepted: the stiffness grew at each."""
 
-FIRST_STIFFNESS, STIFFNESS_FACTOR = 10.0, 10.0
+FIRST_STIFFNESS, STIFFNESS_FACTOR, EASY_FACTOR = 10.0, 4.0, 10.0
+"""The stiffness grows faster after an outer step that took a single Newton step."""
+
 LARGEST_STIFFNESS = {"float32": 1e5, "float64": 1e9}
 """The linear system loses the mass of a body beside a stiffness near the inverse of round-off."""
+
+MEASURE = 1e3
+"""Stiffness of the laws by which residuals are measured: that many times less counts an error of an impulse, whose round-off
+beside a light body is large, than the velocity that it stands for."""
 
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
 """Residual at which a world is done, relative to the largest velocity or constraint error of the unconstrained motion."""
@@ -73,11 +83,10 @@ class _Search(NamedTuple):
     """State of the iteration; arrays (world,) but for the first four.
 
     Attributes:
-      velocity: current, equal to that of the impulses `trial`.
-      trial: impulses of the inner iteration.
+      velocity: current, equal to that of the impulses ``centre + trial``.
+      trial: impulses of the inner iteration, less `centre`.
       centre: impulses that the proximal term pulls to.
-      best: impulses with the least residual so far, and the velocity that was found with them: by increments, since the
-        round-off of large impulses, ``u_free + M^-1 J^T impulses``, would shake a light body under a heavy one.
+      best: impulses with the least residual so far, and their velocity.
       least: that residual.
       residual: after the last outer step.
       stiffness: of the laws.
@@ -134,7 +143,7 @@ def solve(rows: tuple[Rows, ...], velocity: Array, impulses: Impulses) -> tuple[
     residual = jnp.broadcast_to(problem.residual(impulses, problem.errors(start)), (worlds,))
     search = _Search(
         start,
-        impulses,
+        tuple(jnp.zeros_like(part) for part in impulses),
         impulses,
         (start, impulses),
         residual,
@@ -147,7 +156,10 @@ def solve(rows: tuple[Rows, ...], velocity: Array, impulses: Impulses) -> tuple[
     )
     search = lax.while_loop(lambda s: (s.count < LIMIT) & ~s.done.all(), problem.iterate, search)
     failed = jnp.where(search.least <= problem.acceptable, 0.0, 1.0).astype(velocity.dtype)
-    return *search.best, failed
+    velocity, impulses = search.best
+    # What a large impulse lost on its way to a small one is round-off of the large one.
+    impulses = tuple(group.law.project(part) for group, part in zip(rows, impulses, strict=True))
+    return velocity, impulses, failed
 
 
 class _Problem:
@@ -155,16 +167,18 @@ class _Problem:
 
     def __init__(self, rows: tuple[Rows, ...], free: Array) -> None:
         self.rows, self.free = rows, free
-        self.root = [jnp.sqrt(masses(group.law)) for group in rows]
-        size = [
+        none = tuple(jnp.zeros_like(group.bias) for group in rows)
+        sizes = [
             dataclasses.replace(group, matrix=Dense(tuple(jnp.abs(j) for j in group.jacobian), group.response))
             for group in rows
         ]
-        speed = _largest((r * row_velocity(s, jnp.abs(free)) for r, s in zip(self.root, size, strict=True)), free)
-        none = tuple(jnp.zeros_like(group.bias) for group in rows)
-        scale = speed + self.residual(none, self.errors(free))
-        self.tolerance = TOLERANCE[str(free.dtype)] * scale
-        self.acceptable = ACCEPTABLE[str(free.dtype)] * scale
+        violations = [
+            safe_divide(jnp.abs(group.law.change(old, error)), jnp.broadcast_to(masses(group.law), old.shape))
+            for group, old, error in zip(rows, none, self.errors(free), strict=True)
+        ]
+        speeds = [row_velocity(size, jnp.abs(free)) + part for size, part in zip(sizes, violations, strict=True)]
+        self.weights = compute_once(_weights(rows, speeds, free), free)
+        self.tolerance, self.acceptable = TOLERANCE[str(free.dtype)], ACCEPTABLE[str(free.dtype)]
 
     def errors(self, velocity: Array) -> Impulses:
         """Constraint errors of all rows."""
@@ -172,16 +186,17 @@ class _Problem:
 
     def residual(self, impulses: Impulses, errors: Impulses) -> Array:
         """Largest distance (world,) of impulses from those that the laws ask for."""
-        parts = tuple(
-            safe_divide(jnp.abs(old - group.law.update(old, error)), jnp.broadcast_to(root, old.shape))
-            for group, old, error, root in zip(self.rows, impulses, errors, self.root, strict=True)
-        )
+        parts = []
+        for group, old, error, weight in zip(self.rows, impulses, errors, self.weights, strict=True):
+            law = stiffen(group.law, jnp.full(1, MEASURE, error.dtype))
+            mass = jnp.broadcast_to(masses(law), old.shape)
+            parts.append(weight * safe_divide(jnp.abs(law.change(old, error)), mass))
         return _largest(parts, self.free)
 
     def project(self, stiffness: Array, centre: Impulses, errors: Impulses) -> Impulses:
-        """Impulses of the stiffened laws."""
+        """Impulses of the stiffened laws, less `centre`."""
         impulses = tuple(
-            stiffen(group.law, stiffness).update(old, error)
+            stiffen(group.law, stiffness).change(old, error)
             for group, old, error in zip(self.rows, centre, errors, strict=True)
         )
         return compute_once(impulses, self.free)
@@ -199,22 +214,25 @@ class _Problem:
         direction = -velocity_system.solve_once(self.rows, slopes, change)
         found = self.line_search(search, errors, impulses, slopes, direction, energy)
 
-        mismatch = (r * jnp.abs(row_velocity(g, found.change)) for r, g in zip(self.root, self.rows, strict=True))
+        new_centre = tuple(old + change for old, change in zip(search.centre, found.impulses, strict=True))
+        kept = tuple(t - (new - old) for t, new, old in zip(found.trial, new_centre, search.centre, strict=True))
+        mismatch = (w * jnp.abs(row_velocity(g, found.change)) for w, g in zip(self.weights, self.rows, strict=True))
         inner = _largest(mismatch, self.free)
-        residual = jnp.maximum(inner, self.residual(found.impulses, found.error))
+        residual = jnp.maximum(inner, self.residual(new_centre, found.error))
         gives_up = search.newton >= NEWTON_LIMIT
         outer = gives_up | (inner <= INEXACT * search.residual) | (inner <= self.tolerance)
         slow = outer & (residual > SLOW * search.residual)
         harder = outer & ~gives_up & (slow | (search.newton == 0))
-        stiffness = jnp.where(harder, search.stiffness * STIFFNESS_FACTOR, search.stiffness)
+        factor = jnp.where(search.newton == 0, EASY_FACTOR, STIFFNESS_FACTOR)
+        stiffness = jnp.where(harder, search.stiffness * factor, search.stiffness)
         stiffness = jnp.where(gives_up, search.stiffness / STIFFNESS_FACTOR, stiffness)
         slow_steps = jnp.where(outer, jnp.where(slow, search.slow + 1, 0), search.slow)
         better = residual < search.least
         new = _Search(
             velocity=found.velocity,
-            trial=found.trial,
-            centre=_where(outer, found.impulses, search.centre),
-            best=_where(better, (found.velocity, found.impulses), search.best),
+            trial=_where(outer, kept, found.trial),
+            centre=_where(outer, new_centre, search.centre),
+            best=_where(better, (found.velocity - found.change, new_centre), search.best),
             least=jnp.where(better, residual, search.least),
             residual=jnp.where(outer, residual, search.residual),
             stiffness=jnp.clip(stiffness, 1.0, LARGEST_STIFFNESS[str(self.free.dtype)]),
@@ -223,10 +241,10 @@ class _Problem:
             done=(residual <= self.tolerance) | ((slow_steps >= PATIENCE) & (search.least <= self.acceptable)),
             count=search.count + 1,
         )
-        kept = jax.tree.map(
+        chosen = jax.tree.map(
             lambda a, b: jnp.where(search.done, a, b), search._replace(count=()), new._replace(count=())
         )
-        return kept._replace(done=search.done | new.done, count=new.count)
+        return chosen._replace(done=search.done | new.done, count=new.count)
 
     def mismatch(self, trial: Impulses, impulses: Impulses) -> tuple[Array, Array]:
         """Velocity change from the one impulses to the others, and its kinetic energy, times 2."""
@@ -254,6 +272,9 @@ class _Problem:
             for part, old, matrix, rate in zip(impulses, search.trial, slopes, rates, strict=True)
         )
         toward = compute_once(toward, self.free)
+        # The step that these impulses make: by that of the linear system its round-off would part velocity and impulses.
+        direction = compute_once(add_impulses(self.rows, jnp.zeros_like(self.free), toward), self.free)
+        rates = compute_once(tuple(row_velocity(group, direction) for group in self.rows), self.free)
 
         def at(step: Array) -> _Trial:
             trial = tuple(old + step * change for old, change in zip(search.trial, toward, strict=True))
@@ -278,6 +299,27 @@ class _Problem:
 
 def _where(condition: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _weights(rows: tuple[Rows, ...], speeds: list[Array], like: Array) -> tuple[Array, ...]:
+    """What a velocity of each row counts in residuals, from the largest ones of the unconstrained motion.
+
+    Rows of contacts are all in m/s. Those of joints may be in rad/s, which energies alone compare with others.
+    """
+    roots = [jnp.sqrt(masses(group.law)) for group in rows]
+    energy = _inverse(_largest((root * speed for root, speed in zip(roots, speeds, strict=True)), like))
+    weights = [root * energy for root in roots]
+    contacts = [k for k, group in enumerate(rows) if isinstance(group.law, Cone | Push)]
+    if contacts:
+        speed = _inverse(_largest((jnp.where(roots[k] > 0, speeds[k], 0.0) for k in contacts), like))
+        for k in contacts:
+            weights[k] = jnp.where(roots[k] > 0, jnp.maximum(weights[k], speed), 0.0)
+    return tuple(weights)
+
+
+def _inverse(scale: Array) -> Array:
+    """Inverse of a scale of residuals: of 1 where nothing moves, since old impulses may be wrong there."""
+    return 1.0 / jnp.where(scale > 1e-30, scale, 1.0)
 
 
 def _largest(values: Iterable[Array], like: Array) -> Array:

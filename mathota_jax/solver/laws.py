@@ -53,6 +53,15 @@ class Bounded:
         """The nearest impulse that is allowed."""
         return jnp.clip(impulse, self.lower, self.upper)
 
+    def change(self, impulse: Array, error: Array) -> Array:
+        """`update` less the old impulse, to the last digit of a small change of a large impulse."""
+        free = -(error + self.softness * impulse) * self.effective_mass
+        return jnp.clip(free, self.lower - impulse, self.upper - impulse)
+
+    def project(self, impulse: Array) -> Array:
+        """The nearest impulse that the law allows."""
+        return jnp.clip(impulse, self.lower, self.upper)
+
 
 @pytree
 class Push(Bounded):
@@ -103,19 +112,38 @@ class Cone:
         error_n, *errors = unstack(error, row)
         return self.with_friction(jnp.maximum(old_n - error_n * self.normal_mass, 0.0), old, errors)
 
+    def change(self, impulse: Array, error: Array) -> Array:
+        """`update` less the old impulse, to the last digit of a small change of a large impulse."""
+        row = impulse.ndim - 3
+        old_n, old_1, old_2 = unstack(impulse, row)
+        error_n, error_1, error_2 = unstack(error, row)
+        normal = jnp.maximum(-error_n * self.normal_mass, -old_n)
+        change_1, change_2 = -error_1 * self.tangent_mass, -error_2 * self.tangent_mass
+        free_1, free_2 = old_1 + change_1, old_2 + change_2
+        less = self._share(old_n + normal, free_1, free_2) - 1.0
+        return jnp.stack([normal, change_1 + free_1 * less, change_2 + free_2 * less], axis=row)
+
+    def project(self, impulse: Array) -> Array:
+        """The impulse with the normal row not below 0 and the tangents within friction."""
+        return self.update(impulse, jnp.zeros_like(impulse))
+
     def with_friction(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> Array:
         """All three rows for a new impulse of the normal row; `old` and `errors` are those of the tangents."""
         (old_1, old_2), (error_1, error_2) = old, errors
         free_1 = old_1 - error_1 * self.tangent_mass
         free_2 = old_2 - error_2 * self.tangent_mass
+        scale = self._share(normal, free_1, free_2)
+        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
+
+    def _share(self, normal: Array, free_1: Array, free_2: Array) -> Array:
+        """What friction leaves of tangential impulses: 1 where it holds."""
         # Compared as velocities: the square of the impulse of a body of 0.1 mm underflows.
         inverse = safe_divide(jnp.ones_like(self.tangent_mass), self.tangent_mass)
         speed_1, speed_2, limit = free_1 * inverse, free_2 * inverse, self.friction * normal * inverse
         squared = speed_1 * speed_1 + speed_2 * speed_2
         # At the apex of the cone nothing sticks: a derivative must not see friction where nothing presses.
         sliding = squared >= limit * limit
-        scale = jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
-        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
+        return jnp.where(sliding, safe_divide(limit, safe_sqrt(squared)), 1.0)
 
 
 Law = Bounded | Cone

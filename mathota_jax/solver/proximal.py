@@ -32,11 +32,11 @@ def stiffen(law: Law, stiffness: Array) -> Law:
 
 
 def slope(law: Law, impulse: Array, error: Array) -> Array:
-    """Jacobian (turn, row, row', column, world) of the new impulse by the error; semismooth: one of its elements."""
+    """Jacobian (turn, row, row', column, world) of the change by the error; semismooth: one of its elements."""
     row_count = impulse.shape[1]
     zero = jnp.zeros_like(error)
     columns = [
-        jax.jvp(lambda error: law.update(impulse, error), (error,), (zero.at[:, row].set(1.0),))[1]
+        jax.jvp(lambda error: law.change(impulse, error), (error,), (zero.at[:, row].set(1.0),))[1]
         for row in range(row_count)
     ]
     return jnp.stack(columns, axis=2)
