@@ -190,16 +190,19 @@ def correct_positions(
     if problem.joints is not None:
         error = joint_rows.joint_rows(model, merge(scene, bodies, moved)).error
         bounded = () if problem.responses is None else bounded_slots(scene)
+        if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
+            back = mechanism_rows.leave_stops(
+                problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
+            )
+        if problem.responses is not None and covers_with_bounds(scene):
+            # What holds is closed at the end of the step.
+            return moved if back is None else displace(moved, inertia, back)
         rows += [
             joint.position_rows(scene, group.table, problem.joints, error, inertia, bounded)
             if how is None
             else joint.decoupled_position_rows(scene, group, how, problem.joints, error)
             for group, how in zip(problem.joint_rows, problem.of_joint_rows, strict=True)
         ]
-        if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
-            back = mechanism_rows.leave_stops(
-                problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
-            )
     for group in problem.contact_rows:
         rows.append(contact.position_rows(group, packed, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
