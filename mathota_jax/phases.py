@@ -21,7 +21,13 @@ from mathota_jax.constraints import (
     motor,
     rebound_limit,
 )
-from mathota_jax.constraints.mechanism_layout import bounded_slots, covers, covers_with_bounds, layout
+from mathota_jax.constraints.mechanism_layout import (
+    bounded_slots,
+    covers,
+    covers_with_bounds,
+    layout,
+    takes_small_steps,
+)
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import drift, free_velocity
@@ -50,8 +56,7 @@ def acting_inertia(model: Model, blocks: Bodies, inertia: Inertia) -> tuple[Iner
 
     Joints act at the middle of the step, see `drift`; all else at its start.
     """
-    options = model.scene.options
-    if not joint_layout.joint_row_count(model.scene) or inertia.rotation is None or options.solver == "soft_step":
+    if not joint_layout.joint_row_count(model.scene) or inertia.rotation is None or takes_small_steps(model.scene):
         return inertia, None
     return compute_once(drift(store_cotangents(blocks), inertia, 0.5 * model.dt), blocks.position.x)
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
-    "within 10 s of steps of 1/60 s; the other solvers hold them to 7e-6 of a link, as trees that are solved exactly",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
