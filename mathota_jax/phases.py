@@ -21,7 +21,13 @@ from mathota_jax.constraints import (
     motor,
     rebound_limit,
 )
-from mathota_jax.constraints.mechanism_layout import bounded_slots, covers, covers_with_bounds, layout
+from mathota_jax.constraints.mechanism_layout import (
+    bounded_slots,
+    covers,
+    covers_with_bounds,
+    layout,
+    takes_small_steps,
+)
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.dynamics import events, sleep
 from mathota_jax.dynamics.free_motion import drift, free_velocity
@@ -50,8 +56,7 @@ def acting_inertia(model: Model, blocks: Bodies, inertia: Inertia) -> tuple[Iner
 
     Joints act at the middle of the step, see `drift`; all else at its start.
     """
-    options = model.scene.options
-    if not joint_layout.joint_row_count(model.scene) or inertia.rotation is None or options.solver == "soft_step":
+    if not joint_layout.joint_row_count(model.scene) or inertia.rotation is None or takes_small_steps(model.scene):
         return inertia, None
     return compute_once(drift(store_cotangents(blocks), inertia, 0.5 * model.dt), blocks.position.x)
 
@@ -190,16 +195,19 @@ def correct_positions(
     if problem.joints is not None:
         error = joint_rows.joint_rows(model, merge(scene, bodies, moved)).error
         bounded = () if problem.responses is None else bounded_slots(scene)
+        if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
+            back = mechanism_rows.leave_stops(
+                problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
+            )
+        if problem.responses is not None and covers_with_bounds(scene):
+            # What holds is closed at the end of the step.
+            return moved if back is None else displace(moved, inertia, back)
         rows += [
             joint.position_rows(scene, group.table, problem.joints, error, inertia, bounded)
             if how is None
             else joint.decoupled_position_rows(scene, group, how, problem.joints, error)
             for group, how in zip(problem.joint_rows, problem.of_joint_rows, strict=True)
         ]
-        if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
-            back = mechanism_rows.leave_stops(
-                problem.responses, problem.joint_rows, bounded, problem.joints, error, options.velocity_iterations
-            )
     for group in problem.contact_rows:
         rows.append(contact.position_rows(group, packed, options.position_percent))
     start = tuple(jnp.zeros_like(group.bias) for group in rows)

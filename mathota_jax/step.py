@@ -12,7 +12,7 @@ from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
 from mathota_jax.constraints.lever import levers
-from mathota_jax.constraints.mechanism_layout import layout
+from mathota_jax.constraints.mechanism_layout import layout, takes_small_steps
 from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
@@ -162,7 +162,8 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
     else:
         start, change = starting_impulses(model, state, problem, acting, packed)
     lever, beyond, gained, failed, last = None, None, None, None, None
-    if scene.options.solver == "soft_step":
+    small = takes_small_steps(scene)
+    if small:
         solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
         solved, impulses, failed = solve_rows(scene, problem, packed, start, change, known is not None)
@@ -171,7 +172,7 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
         blocks, inertia, acting, halfway, free, torque, decay, solved, lever, model.dt, beyond, gained
     )
     moved, displacement = compute_once((moved, displacement), state.position)
-    if scene.options.solver != "soft_step":
+    if not small:
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
         moved = stop_at_impacts(model, bodies, moved, displacement)

@@ -8,11 +8,11 @@ from __future__ import annotations
 SWEEPS = "not converged with the default 10 sweeps; "
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_soft_step.py::test_ball_and_chain_holds": "forty links with a ball of 672 times their mass are NaN "
-    "within 10 s of steps of 1/60 s; the other solvers hold them to 7e-6 of a link, as trees that are solved exactly",
-    "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "by the masses, through stops, friction "
-    "and motors at once, forward and reverse mode differ by 1.8e-3, gate 1e-9; half of it goes with the sweeps that correct "
-    "positions, whose linear systems the two modes solve by a few sweeps each",
+    "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": SWEEPS
+    + "by the masses, through 20 steps with stops, friction and motors, the modes differ by 2.7e-3, gate 1e-9, from the "
+    "first step at a stop on, while the Jacobians of each step agree to 1e-12. By inference: friction at its cap and a stop "
+    "on one joint want the same rate, so that round-off decides which gives way, which makes a difference before the sweeps "
+    "converge",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
@@ -21,10 +21,10 @@ SHORTFALLS: dict[str, str] = {
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
-        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "finite, but two boxes "
-        f"with a pendulum on the upper, at rest, gain {gain} times their energy in steps of 100 s, 640 times in 10 s "
-        "and 4 % in 0.1 s (float64), gate 1 %; none in steps of 1e-12 to 1e-3 s and of 1 s"
-        for precision, gain in (("float32", "8e9"), ("float64", "9e4"))
+        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{precision}]": "two boxes with a "
+        "pendulum on the upper, at rest, gain 3.2 % of their energy in 20 steps of 0.1 s (float64), gate 1 %, and without "
+        f"bound in steps of 10 and 100 s (factor {gain}); none in steps up to 1/60 s and of 1 s"
+        for precision, gain in (("float32", "3e20"), ("float64", "1e33"))
     },
     "tests/physics/test_chain.py::test_thin_rods_do_not_blow_up_at_a_large_step[sweeps]": "two joints left to 10 sweeps (as "
     "beside contacts), rods with 5000 times less inertia about one axis: not finite, with 40 sweeps either; 200 hold "

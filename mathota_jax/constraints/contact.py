@@ -30,7 +30,7 @@ from mathota_jax.constraints.assembly import (
     turn_of_points,
 )
 from mathota_jax.constraints.effective_mass import first_grip, normal_bound, tangent_bound
-from mathota_jax.constraints.impact import Approach, impact, rebound
+from mathota_jax.constraints.impact import Approach, impact, loaded, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Cone, Push
@@ -62,6 +62,18 @@ class Motion(NamedTuple):
     gravity: Vec3
 
 
+class Load(NamedTuple):
+    """Rebounds of contacts that may carry others, (turn, 1, column, world).
+
+    Attributes:
+      asked: change of the normal velocity that the rebound asks for; 0 for no rebound.
+      lever: time [s] that the impulse has to act if most of it carries others.
+    """
+
+    asked: Array
+    lever: Array
+
+
 class ContactRows(NamedTuple):
     """Rows of one table with what else the step needs to know of its contacts.
 
@@ -76,6 +88,7 @@ class ContactRows(NamedTuple):
       falling: (turn, row, column, world) change of each row's velocity by gravity during the lever; None where no rebounds
         need a limit.
       sign: (turn, 1, world) of the directions that the matrix keeps; None where it is +.
+      load: what becomes of the lever where a rebound also carries others; None where nothing bounces.
     """
 
     rows: Rows
@@ -86,6 +99,7 @@ class ContactRows(NamedTuple):
     size: Array
     falling: Array | None = None
     sign: Array | None = None
+    load: Load | None = None
 
 
 class PlacedPairs(NamedTuple):
@@ -191,7 +205,10 @@ def contact_rows(
     )
     size = pack_scalars(table, [smaller_side(table, take(model.size, scene.dynamic_bodies), places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
-    falling = None
+    falling, load = None, None
+    if scene.restitution and scene.options.solver != "soft_step":
+        asked, lasting = loaded(approach, target, lever, model.dt)
+        load = Load(*(pack_scalars(table, [part], worlds) for part in (asked, lasting)))
     if scene.rebounds_together:
         side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
         falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
@@ -203,6 +220,7 @@ def contact_rows(
         scene.options.slop * size,
         size,
         falling,
+        load=load,
     )
 
 

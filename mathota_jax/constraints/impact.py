@@ -57,6 +57,18 @@ def impact(approach: Approach, dt: Array) -> tuple[Array, Array]:
     return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
 
 
+def loaded(approach: Approach, target: Array, lever: Array, dt: Array) -> tuple[Array, Array]:
+    """Change of the normal velocity that a rebound asks for, 0 for none; its lever if its impulse mostly carries others.
+
+    A box that settles on another by 1 mm/s may rebound by half of that, while its contact carries all that rests on it
+    through the step: the lever of the impact, all of the step, would lift it by twice its fall.
+    """
+    bounces, asked = target > 0, jnp.maximum(target - approach.free, 0.0)
+    share = safe_divide(asked, asked + norm(approach.gravity) * dt)
+    lasting = 0.5 * dt + share * (lever - 0.5 * dt)
+    return jnp.where(bounces, asked, 0.0), jnp.where(bounces, lasting, lever)
+
+
 def rebound(approach: Approach, dt: Array, latest: Array) -> tuple[Array, Array]:
     """The same for the small steps, which stop an approach at the surface before the restitution pass; 0 for no bounce.
 

@@ -7,9 +7,9 @@ import functools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
-from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.constraints.contact import ContactRows, normal_mass
 from mathota_jax.scene import Scene
 from mathota_jax.solver.row_matrix import Dense, RowMatrix, sum_over_points
 from mathota_jax.solver.rows import Rows, add_changes
@@ -19,6 +19,10 @@ from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3, dot
 from mathota_jax.struct import pytree
+
+LOADED = 4.0
+"""Impulse of a contact, over that of its rebound alone, from which it counts as carrying others. (The mass of a contact is
+bounded for the points of a manifold pushing together; a point that pushes alone takes more of it.)"""
 
 
 @functools.cache
@@ -63,6 +67,7 @@ def levers(
         return half * jnp.ones_like(solved[0]), None
     several = _several_pairs(scene)
     count = len(joint_rows)
+    contact_rows = [_under_load(group, part) for group, part in zip(contact_rows, impulses[count:], strict=True)]
     total = jnp.zeros((6 if several else 2, *solved.shape[1:]), solved.dtype)
     for group, impulse in zip(joint_rows, impulses[:count], strict=True):
         # The linear part of the Jacobian makes a weight [N s] of the impulse, 0 for a row that only turns.
@@ -84,6 +89,17 @@ def levers(
             total = add_changes(group.rows, Dense((), parts), total, impulse[:, :1])
     mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
     return mean, _beyond(total[2:], mean - half, solved - free) if several else None
+
+
+def _under_load(group: ContactRows, impulse: Array) -> ContactRows:
+    """The contacts with the levers that rebounds have where they carry others."""
+    if group.load is None:
+        return group
+    alone, found = LOADED * normal_mass(group.rows) * group.load.asked, impulse[:, :1]
+    share = jnp.where((alone > 0) & (found > alone), safe_divide(alone, found), 1.0)
+    # Which of the two it is has no derivative.
+    share = store(lax.stop_gradient(share), found)
+    return group._replace(lever=group.load.lever + (group.lever - group.load.lever) * share)
 
 
 def _beyond(total: Array, mean: Array, change: Array) -> Vec3:

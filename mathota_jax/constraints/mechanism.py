@@ -282,7 +282,9 @@ def _respond_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
         force, torque = take(unpack_blocks(impulse), links.layout.blocks)
         alone = pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque))
         excess = _to_blocks(links.layout, alone) - found
-        return excess + push(links, solve(links, jax.tree.map(jnp.negative, rates(links, excess))))
+        # Of what is found the rates are 0, but not once the rows turn.
+        wanted = jax.tree.map(lambda *parts: -sum(parts), rates(links, excess), rates(links, found))
+        return excess + push(links, solve(links, wanted))
 
     return found, jax.jvp(again, primals, tangents)[1]
 

@@ -92,10 +92,12 @@ def layout(scene: Scene) -> Layout | None:
     """The mechanisms of a scene; None where there is none, or where joints are left to the solver."""
     options = scene.options
     # Between impacts bodies follow paths of constant force, which a closing of the joints would leave.
-    if options.solver == "soft_step" or options.impact_events or not options.exact_joints:
+    if options.impact_events or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
-    return found if found is not None and _has_no_others(scene, found) else _of_trees(scene, LEAST_JOINTS)
+    if found is not None and _has_no_others(scene, found):
+        return found
+    return None if options.solver == "soft_step" else _of_trees(scene, LEAST_JOINTS)
 
 
 def _of_trees(scene: Scene, least: int) -> Layout | None:
@@ -131,6 +133,11 @@ def covers(scene: Scene) -> bool:
     """Whether the scene has no other rows than those that mechanisms hold."""
     found = layout(scene)
     return found is not None and _has_no_others(scene, found)
+
+
+def takes_small_steps(scene: Scene) -> bool:
+    """Whether a step is one of small ones: not where mechanisms are solved at once, which no small step does better."""
+    return scene.options.solver == "soft_step" and not covers(scene)
 
 
 def covers_with_bounds(scene: Scene) -> bool:

@@ -90,7 +90,7 @@ def constrain(
       action: (motor, world).
     """
     scene = model.scene
-    small_steps = scene.options.solver == "soft_step"
+    small_steps = mechanism_layout.takes_small_steps(scene)
     joints, held, responses, tables, errors, decouplings = None, None, None, (), (), None
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)

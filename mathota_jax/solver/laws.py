@@ -43,15 +43,11 @@ class Bounded:
 
     def update(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse, clamped as a whole (not its increment: guide 8.4 errs there)."""
-        return self.within_bounds(self.free(impulse, error))
+        return self.project(self.free(impulse, error))
 
     def free(self, impulse: Array, error: Array) -> Array:
         """New accumulated impulse if there were no bounds."""
         return impulse - (error + self.softness * impulse) * self.effective_mass
-
-    def within_bounds(self, impulse: Array) -> Array:
-        """The nearest impulse that is allowed."""
-        return jnp.clip(impulse, self.lower, self.upper)
 
     def change(self, impulse: Array, error: Array) -> Array:
         """`update` less the old impulse, to the last digit of a small change of a large impulse."""

@@ -95,7 +95,7 @@ def slopes_of(law: Law, impulse: Array, error: Array) -> Slopes:
     """Those of a law of a whole table at its fixed point, stored."""
     if isinstance(law, Bounded):
         free = law.free(impulse, error)
-        inside = jax.jvp(law.within_bounds, (free,), (jnp.ones_like(free),))[1]
+        inside = jax.jvp(law.project, (free,), (jnp.ones_like(free),))[1]
         softened = inside * law.effective_mass
         return compute_once(BoundedSlopes(inside - softened * law.softness, -softened), impulse)
     return compute_once(_of_cone(law, impulse, error), impulse)

@@ -89,7 +89,8 @@ def factorize(tree: Tree, masses: Masses, offset: Array, columns: Pair) -> Facto
       offset: (3, link, world) from the parent's centre to the link's; anything for links without parent.
       columns: free relative motions as in `Factors`.
     """
-    count, worlds = len(tree.parents), columns[0].shape[-1]
+    count = len(tree.parents)
+    worlds = max(leaf.shape[-1] for leaf in (*masses, offset, columns[0]))
     matrix = _cross_matrix(offset, worlds)
     unit = jnp.eye(3, dtype=columns[0].dtype)[None, :, :, None]
     linear = unit * jnp.broadcast_to(masses.mass[:, None, None], (count, 3, 3, worlds))

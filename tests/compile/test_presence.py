@@ -263,6 +263,8 @@ def test_a_gradient_sums_nothing_by_the_library():
     velocity = jnp.zeros((16, *state.velocity.shape))
     text = jax.jit(jax.vmap(jax.grad(loss))).lower(velocity).as_text()
     found = re.findall(r"applies stablehlo\.add across dimensions = \[([\d, ]+)\] : \(tensor<([\dx]+)xf32>", text)
-    sums = [(axes, shape) for axes, shape in found if any(shape.split("x")[int(axis)] != "1" for axis in axes.split(","))]
+    sums = [
+        (axes, shape) for axes, shape in found if any(shape.split("x")[int(axis)] != "1" for axis in axes.split(","))
+    ]
     assert found, "the form of the program has changed"
     assert not sums

@@ -95,6 +95,53 @@ def test_impulses_are_those_of_the_dense_matrix(float64, case, gate):
         gate("velocity", (change[:, :, world].T.reshape(-1) - moved) / np.abs(moved).max(), 1e-9)
 
 
+def links_at(model, state):
+    """The mechanisms of worlds-last arrays."""
+    bodies = unpack(state)
+    blocks = moving(model.scene, bodies)
+    inertia = moving_inertia(model.scene, model, blocks.orientation)
+    return mechanism.links(model.scene, joint_rows(model, bodies), blocks.position, inertia)
+
+
+def in_float64(case):
+    return jax.tree.map(
+        lambda x: x.astype(jnp.result_type(float))[..., None] if x.dtype.kind == "f" else x[..., None], CASES[case]
+    )
+
+
+@pytest.mark.parametrize("case", ["branches", "floating chain"])
+def test_derivative_of_the_response_by_the_poses(float64, case, gate):
+    """Rows that turn find another motion of what already moves along them; against central differences."""
+    model, state = in_float64(case)
+    generator = np.random.default_rng(3)
+    impulse = jnp.asarray(generator.normal(size=(6, len(model.scene.dynamic_bodies), 1)))
+    place, turn = (0.1 * generator.normal(size=leaf.shape) for leaf in (state.position, state.orientation))
+
+    @jax.jit
+    def motion(size):
+        moved = state.orientation + size * turn
+        moved = moved / jnp.linalg.norm(moved, axis=1, keepdims=True)
+        there = dataclasses.replace(state, position=state.position + size * place, orientation=moved)
+        return mechanism.respond(links_at(model, there), impulse)
+
+    slope = np.asarray(jax.jvp(motion, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1])
+    quotient = np.asarray(motion(1e-5) - motion(-1e-5)) / 2e-5
+    gate("slope - quotient, relative", (slope - quotient) / np.abs(quotient).max(), 1e-8)
+
+
+def test_worlds_that_differ_by_masses_alone(float64, gate):
+    """At poses that all share, as where derivatives by the masses are taken in forward mode."""
+    model, state = in_float64("branches")
+    models = dataclasses.replace(model, mass=model.mass * jnp.array([1.0, 3.0]))
+    links = links_at(models, state)
+    wanted = tuple(jnp.ones((len(links.layout.links), 1)) for _ in range(6))
+    found = mechanism.solve(links, mechanism._held(links, wanted))
+    for world in range(2):
+        alone = links_at(dataclasses.replace(model, mass=models.mass[:, world : world + 1]), state)
+        truth = mechanism.solve(alone, mechanism._held(alone, wanted))
+        gate("impulses", [np.abs(a[:, world] - b[:, 0]).max() for a, b in zip(found, truth, strict=True)], 1e-12)
+
+
 def test_which_joints_are_links():
     """Loops and joints without a row that holds are left to the solver, and so are one or two joints beside these."""
 
