@@ -11,8 +11,9 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, place
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints import compact, contact, joint_layout, loops
+from mathota_jax.constraints import compact, joint_layout, loops
 from mathota_jax.constraints.assembly import collect
+from mathota_jax.constraints.contact_force import slot_force
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
@@ -88,9 +89,7 @@ def _mean_forces(scene: Scene, problem: Problem, impulses: tuple[Array, ...], ti
         ]
         found["joint_force"] = collect(tables, values, joint_layout.joint_row_count(scene))
     if problem.contacts is not None:
-        found["contact_force"] = contact.slot_force(
-            problem.contact_rows, list(impulses[count:]), scene.slot_count, time
-        )
+        found["contact_force"] = slot_force(problem.contact_rows, list(impulses[count:]), scene.slot_count, time)
     return found
 
 

@@ -22,6 +22,7 @@ from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
 from mathota_jax.constraints import contact, joint
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.constraints.contact_force import slot_force
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
 from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.joints.rows import STOP
@@ -192,7 +193,7 @@ def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity
     moved = blocks._replace(velocity=linear)
     if angular is not None:
         moved = moved._replace(angular_velocity=angular)
-    forces = [contact.slot_force(groups, list(impulses[len(held) :]), scene.slot_count, model.dt)]
+    forces = [slot_force(groups, list(impulses[len(held) :]), scene.slot_count, model.dt)]
     if held:
         values = [impulse[:, 0] / model.dt for impulse in impulses[: len(held)]]
         forces.append(collect([rows.table for rows in held], values, joint_row_count(scene)))

@@ -23,6 +23,7 @@ from mathota_jax.constraints import (
     substep_rows,
     warm_start,
 )
+from mathota_jax.constraints.contact_force import warm_start_impulse
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.slots import matched_force, own_contacts
 from mathota_jax.model import Model
@@ -169,5 +170,5 @@ def _impulses(model: Model, problem: Problem, joint_force: Array, contact_force:
         for rows, how in zip(problem.joint_rows, problem.of_joint_rows, strict=True)
     ]
     if contact_force is not None:
-        impulses += [contact.warm_start_impulse(group, contact_force, model.dt) for group in problem.contact_rows]
+        impulses += [warm_start_impulse(group, contact_force, model.dt) for group in problem.contact_rows]
     return tuple(impulses)
