@@ -63,7 +63,7 @@ def store(value: Array, source: Array) -> Array:
     return value / (lax.stop_gradient(source) * 0 + 1)
 
 
-def store_cotangents(values: Any) -> Any:
+def store_cotangents(values: Any, *, for_one_reader: bool = False) -> Any:
     """Returns the pytree unchanged, at no cost; in reverse mode each cotangent is computed exactly once.
 
     The cotangent of a vector that a matrix multiplies goes into those of the nine entries of the matrix, and its expression
@@ -71,20 +71,24 @@ def store_cotangents(values: Any) -> Any:
 
     Args:
         values: Pytree of floating-point arrays.
+        for_one_reader: Whether also from a kernel that alone reads it, such as that of the rows that a selection pads (see
+            `materialize`).
     """
-    return jax.tree.map(_store_cotangent_p.bind, values)
+    return jax.tree.map(lambda x: _store_cotangent_p.bind(x, for_one_reader=for_one_reader), values)
 
 
-def _transpose_store_cotangent(cotangent: Any, array: Any) -> list[Any]:
-    return [ad.Zero(array.aval) if type(cotangent) is ad.Zero else store(cotangent, cotangent)]
+def _transpose_store_cotangent(cotangent: Any, array: Any, *, for_one_reader: bool) -> list[Any]:
+    if type(cotangent) is ad.Zero:
+        return [ad.Zero(array.aval)]
+    return [materialize(cotangent) if for_one_reader else store(cotangent, cotangent)]
 
 
 _store_cotangent_p = Primitive("store_cotangent")
-_store_cotangent_p.def_impl(lambda array: array)
-_store_cotangent_p.def_abstract_eval(lambda array: ShapedArray(array.shape, array.dtype))
+_store_cotangent_p.def_impl(lambda array, **_: array)
+_store_cotangent_p.def_abstract_eval(lambda array, **_: ShapedArray(array.shape, array.dtype))
 ad.deflinear2(_store_cotangent_p, _transpose_store_cotangent)
 batching.defvectorized(_store_cotangent_p)
-mlir.register_lowering(_store_cotangent_p, mlir.lower_fun(lambda array: array, multiple_results=False))
+mlir.register_lowering(_store_cotangent_p, mlir.lower_fun(lambda array, **_: array, multiple_results=False))
 
 
 def materialize(values: Any) -> Any:

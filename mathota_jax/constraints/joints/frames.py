@@ -39,8 +39,11 @@ def joint_frames(model: Model, bodies: Bodies, joints: tuple[int, ...]) -> Joint
     entries = [model.scene.joints[joint] for joint in joints]
     parents, children = [entry.parent for entry in entries], [entry.child for entry in entries]
     # The derivative by a pose goes through all rows of its joints: once for each component is enough.
-    parent_position, parent_orientation = store_cotangents(take((bodies.position, bodies.orientation), parents))
-    child_position, child_orientation = store_cotangents(take((bodies.position, bodies.orientation), children))
+    parent_pose, child_pose = (
+        store_cotangents(take((bodies.position, bodies.orientation), side), for_one_reader=True)
+        for side in (parents, children)
+    )
+    (parent_position, parent_orientation), (child_position, child_orientation) = parent_pose, child_pose
     anchor_parent, anchor_child, frame_parent, frame_child = take(
         (
             vector(model.joint_anchor_parent),
