@@ -40,8 +40,8 @@ from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices, add_slices, largest_slice
 
 LIMIT = 300
-"""Largest number of linear systems in a solve. Measured: ten boxes at rest take 1 or 2, a falling pile 20; of 46,080 steps of
-a cube under one of 1e5 times its mass in float32, two took more than 150 and none 300."""
+"""Largest number of linear systems in a solve. Measured: ten boxes at rest take 1 or 2, a falling pile 20; of 46,080 steps
+of a cube under one of 1e5 times its mass in float32, two took more than 150 and none 300."""
 
 NEWTON_LIMIT = 5
 """Newton steps without success after which the problem is made softer."""
