@@ -88,10 +88,12 @@ def solve_rows(
     start: tuple[Array, ...],
     change: Array | None = None,
     known: bool = False,
-) -> tuple[Array, tuple[Array, ...], Array | None]:
+    held: mechanism.Impulses | None = None,
+) -> tuple[Array, tuple[Array, ...], Array | None, mechanism.Impulses | None]:
     """Phase 5: velocity constraints, unless `start` is `known` to solve them; `change` is what it does to the velocity.
 
-    Also 1 for each world (world,) that was not solved; None from "pgs".
+    Also 1 for each world (world,) that was not solved, None from "pgs"; and what mechanisms alone are `held` with, which
+    may be known.
     """
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
@@ -102,18 +104,23 @@ def solve_rows(
             again = functools.partial(_impulses, scene, velocity, start, change)
             contacts = tuple(problem.contact_rows)
             solved, impulses = rebound_limit.limit(again, problem.joint_rows, contacts, velocity, solved, impulses)
-        return solved, impulses, failed
-    return _solve_mechanisms(scene, problem, problem.held, velocity, start)
+        return solved, impulses, failed, None
+    if covers(scene):
+        nothing = tuple(jnp.zeros_like(impulse) for impulse in start)
+        solved, impulses, held = mechanism.hold(problem.held, problem.joint_rows, velocity, nothing, held)
+        return solved, impulses, None, held
+    return *_solve_mechanisms(scene, problem, problem.held, velocity, start), None
 
 
 def _solve_mechanisms(
     scene: Scene, problem: Problem, held: mechanism.Links, velocity: Array, start: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
-    """`solve_rows` where there are mechanisms: what they hold, holds exactly in the end."""
+    """`solve_rows` where there are mechanisms and other rows: what the former hold, holds exactly in the end."""
     rows = problem.rows
-    hold = functools.partial(mechanism.hold, held, problem.joint_rows)
-    if covers(scene):
-        return *hold(velocity, tuple(jnp.zeros_like(impulse) for impulse in start)), None
+
+    def hold(velocity: Array, impulses: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        return mechanism.hold(held, problem.joint_rows, velocity, impulses)[:2]
+
     responses = problem.responses if scene.options.solver == "pgs" else None
     bounded = () if responses is None else bounded_slots(scene)
     failed, joint_count = None, len(problem.joint_rows)
@@ -222,14 +229,18 @@ def correct_positions(
     return displace(moved, inertia, correction if back is None else correction + back)
 
 
-def close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
+def close_joints(
+    model: Model, bodies: Bodies, moved: Bodies, known: mechanism.Impulses | None = None
+) -> tuple[Bodies, mechanism.Impulses]:
     """Mechanisms at the end of the step: their joints closed, and velocities along which they stay closed.
 
-    The second is a projection in the metric of the kinetic energy, and so never adds any.
+    The second is a projection in the metric of the kinetic energy, and so never adds any. Also the impulses of all rounds,
+    which may be `known`.
     """
     scene = model.scene
 
-    def close(moved: Bodies, is_last: Array) -> tuple[Bodies, None]:
+    def close(moved: Bodies, of_round: tuple) -> tuple[Bodies, mechanism.Impulses]:
+        is_last, known = of_round
         inertia = moving_inertia(scene, model, moved.orientation)
         joints = joint_rows.joint_rows(model, merge(scene, bodies, moved))
         weights = jax.tree.map(lambda a, b: jnp.where(is_last, a, b), inertia, mechanism.correction_weights(inertia))
@@ -237,19 +248,23 @@ def close_joints(model: Model, bodies: Bodies, moved: Bodies) -> Bodies:
         velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
         excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
         wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, errors)
-        change = mechanism.push(links, mechanism.solve(links, wanted))
+        impulses = mechanism.solve(links, wanted, known)
+        change = mechanism.push(links, impulses)
         linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
         assert angular is not None
         moved = moved._replace(velocity=linear, angular_velocity=angular)
         if not rounds:
-            return moved, None
+            return moved, impulses
         shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism.bounded(change))
-        return displace(moved, inertia, shift), None
+        return displace(moved, inertia, shift), impulses
 
     rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model)))
     moved = in_every_world(moved, worlds)
-    return lax.scan(close, moved, jnp.arange(rounds + 1) == rounds)[0]
+    if known is not None:
+        # Nothing is left to be found that it would be cheaper to store than to compute again.
+        close = jax.checkpoint(close, prevent_cse=False)
+    return lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
 
 
 def stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:

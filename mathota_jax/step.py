@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
 from mathota_jax.constraints.lever import levers
+from mathota_jax.constraints.mechanism import Solutions
 from mathota_jax.constraints.mechanism_layout import layout, takes_small_steps
 from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
@@ -80,7 +82,7 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
             f"step: the model was built with Options(solver={scene.options.solver!r}), the state was not; take both from "
             "one call of build"
         )
-    return _batched_step(model, state, action)
+    return _batched_step(model, state, action)[0]
 
 
 def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, State]:
@@ -114,42 +116,68 @@ def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, St
     return jax.lax.scan(body, state, actions)
 
 
-def step_worlds_last(model: Model, state: State, action: Array, solved: Forces | None = None) -> State:
-    """`step` for leaves with one trailing world axis; `jax.vmap(step)` calls this.
+class Solved(NamedTuple):
+    """What the solvers of a step find.
 
-    `solved` are the forces that the solver found in this very step; None if it has still to find them.
+    Attributes:
+      forces: of all constraints; None where they are not all that the sweeps find.
+      mechanisms: solutions, where there are mechanisms.
+    """
+
+    forces: Forces | None
+    mechanisms: Solutions | None
+
+
+def step_worlds_last(model: Model, state: State, action: Array) -> State:
+    """`step` for leaves with one trailing world axis."""
+    return _solve_step(model, state, action)[0]
+
+
+def _solve_step(
+    model: Model, state: State, action: Array, solved: Solved | None = None
+) -> tuple[State, Solutions | None]:
+    """The same, and the solutions of mechanisms; `jax.vmap(step)` calls this.
+
+    `solved` is what the solvers found in this very step; None if they have still to find it.
     """
     runs = (model.dt > 0) & (model.dt < jnp.inf)
     # The program must stay finite for the derivative of the selection to be 0.
-    new = _simulate_or_rest(dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0)), state, action, solved)
+    passing = dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0))
+    new, mechanisms = _simulate_or_rest(passing, state, action, solved)
     new = jax.tree.map(lambda before, after: jnp.where(runs, after, before), state, new)
     bad = jnp.where(runs | (model.dt == 0), 0, int(Flag.INVALID_TIME_STEP))
-    return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype))
+    return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype)), jax.lax.stop_gradient(mechanisms)
 
 
-def _simulate_or_rest(model: Model, state: State, action: Array, solved: Forces | None) -> State:
+def _simulate_or_rest(
+    model: Model, state: State, action: Array, solved: Solved | None
+) -> tuple[State, Solutions | None]:
     """`_simulate`, but for batches in which everything sleeps."""
     if not (model.scene.options.sleep and model.scene.dynamic_bodies):
         return _simulate(model, state, action, solved)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((model, state, action)))
-    return jax.lax.cond(
+    new = jax.lax.cond(
         sleep.all_rest(model.scene, state, action),
         lambda model, state, action: in_every_world(sleep.at_rest(state), worlds),
-        lambda model, state, action: in_every_world(_simulate(model, state, action, None), worlds),
+        lambda model, state, action: in_every_world(_simulate(model, state, action, None)[0], worlds),
         model,
         state,
         action,
     )
+    return new, None
 
 
-def _simulate(model: Model, state: State, action: Array, known: Forces | None) -> State:
-    """The phases of a step; `known` are its solved forces, if they are."""
+def _simulate(
+    model: Model, state: State, action: Array, solved_before: Solved | None
+) -> tuple[State, Solutions | None]:
+    """The phases of a step."""
     scene = model.scene
     if scene.options.impact_events and scene.restitution and scene.pair_groups:
-        return split_at_impacts(model, state, action)
+        return split_at_impacts(model, state, action), None
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
-        return new_state(scene, state, moving(scene, bodies), {})
+        return new_state(scene, state, moving(scene, bodies), {}), None
+    known, mechanisms = solved_before or (None, None)
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     acting, halfway = acting_inertia(model, blocks, inertia)
@@ -161,12 +189,13 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
         start, change = known_impulses(model, problem, known), None
     else:
         start, change = starting_impulses(model, state, problem, acting, packed)
-    lever, beyond, gained, failed, last = None, None, None, None, None
+    lever, beyond, gained, failed, last, held, closed = None, None, None, None, None, None, None
     small = takes_small_steps(scene)
     if small:
         solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
-        solved, impulses, failed = solve_rows(scene, problem, packed, start, change, known is not None)
+        held = None if mechanisms is None else mechanisms.held
+        solved, impulses, failed, held = solve_rows(scene, problem, packed, start, change, known is not None, held)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(
         blocks, inertia, acting, halfway, free, torque, decay, solved, lever, model.dt, beyond, gained
@@ -177,26 +206,30 @@ def _simulate(model: Model, state: State, action: Array, known: Forces | None) -
     if scene.options.continuous and scene.pair_groups:
         moved = stop_at_impacts(model, bodies, moved, displacement)
     if problem.held is not None:
-        moved = close_joints(model, bodies, moved)
+        moved, closed = close_joints(model, bodies, moved, None if mechanisms is None else mechanisms.closed)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
     if last is not None and state.end_forces is not None:
         new = dataclasses.replace(new, end_forces=end_forces(model, problem, state.end_forces, last))
-    return let_sleep(model, state, new, action, problem) if scene.options.sleep else new
+    new = let_sleep(model, state, new, action, problem) if scene.options.sleep else new
+    return new, None if closed is None else Solutions(held, closed)
 
 
-def _reusable_forces(new: State, model: Model, state: State, action: Array) -> Forces | None:
-    """The solved forces of the step to `new`, where they are all that its solver found."""
+def _reusable(result: tuple[State, Solutions | None], model: Model, state: State, action: Array) -> Solved | None:
+    """What the solvers of a step found, as far as derivatives can do without finding it again."""
     del state, action
+    new, mechanisms = result
+    if mechanisms is not None:
+        return Solved(None, mechanisms)
     options = model.scene.options
     # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts;
     # mechanisms are solved directly.
     if options.sleep or options.impact_events or options.solver == "soft_step" or layout(model.scene) is not None:
         return None
-    return Forces(new.joint_force, new.contact_force)
+    return Solved(Forces(new.joint_force, new.contact_force), None)
 
 
-def _step_again(solved: Forces | None, model: Model, state: State, action: Array) -> State:
-    return step_worlds_last(model, state, action, solved)
+def _step_again(solved: Solved | None, model: Model, state: State, action: Array) -> tuple[State, Solutions | None]:
+    return _solve_step(model, state, action, solved)
 
 
-_batched_step = batch_last(step_worlds_last, Shortcut(_reusable_forces, _step_again))
+_batched_step = batch_last(_solve_step, Shortcut(_reusable, _step_again))

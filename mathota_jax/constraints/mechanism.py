@@ -11,7 +11,7 @@ A closed loop of joints is no tree and is left to the sweeps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,18 @@ LARGEST_TURN = 0.5
 
 Impulses = tuple[Array, ...]
 """Of the three translations and then the three rotations between each link and its parent, (link, world); 0 where free."""
+
+
+class Solutions(NamedTuple):
+    """What `solve` finds in a step.
+
+    Attributes:
+      held: impulses of the step where there are mechanisms alone, else None.
+      closed: those that close the joints at its end, of all rounds, (round, link, world).
+    """
+
+    held: Impulses | None
+    closed: Impulses
 
 
 @pytree
@@ -230,8 +242,13 @@ def push(links: Links, impulses: Impulses) -> Array:
     return _to_blocks(links.layout, pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque)))
 
 
-def solve(links: Links, wanted: Impulses) -> Impulses:
-    """Impulses that change the rates of the rows by `wanted`; differentiable in both modes."""
+def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impulses:
+    """Impulses that change the rates of the rows by `wanted`; differentiable in both modes.
+
+    Where they are `known`, derivatives are computed without finding them again.
+    """
+    if known is not None:
+        return _known_solution(links, wanted, known)
 
     def product(impulses: Impulses) -> Impulses:
         changes = rates(links, push(links, _held(links, impulses)))
@@ -243,6 +260,21 @@ def solve(links: Links, wanted: Impulses) -> Impulses:
     worlds = max(leaf.shape[-1] for leaf in (*wanted, links.factors.offset, links.offset.x))
     wanted = tuple(jnp.broadcast_to(values, (values.shape[0], worlds)) for values in wanted)
     return lax.custom_linear_solve(product, wanted, lambda _, right: _impulses(links, right), symmetric=True)
+
+
+@jax.custom_jvp
+def _known_solution(links: Links, wanted: Impulses, known: Impulses) -> Impulses:
+    del links, wanted
+    return known
+
+
+@_known_solution.defjvp
+def _known_solution_jvp(primals: tuple, tangents: tuple) -> tuple[Impulses, Impulses]:
+    links, wanted, known = primals
+    found = _known_solution(links, wanted, known)
+    changes = jax.jvp(lambda links: rates(links, push(links, found)), (links,), (tangents[0],))[1]
+    right = _held(links, jax.tree.map(jnp.subtract, tangents[1], changes))
+    return found, solve(links, right)
 
 
 def _impulses(links: Links, wanted: Impulses) -> Impulses:
@@ -333,8 +365,12 @@ def closing_shift(links: Links, errors: Impulses) -> Array:
 
 
 def hold(
-    links: Links, joint_rows: Sequence[Rows], velocity: Array, impulses: tuple[Array, ...]
-) -> tuple[Array, tuple[Array, ...]]:
+    links: Links,
+    joint_rows: Sequence[Rows],
+    velocity: Array,
+    impulses: tuple[Array, ...],
+    known: Impulses | None = None,
+) -> tuple[Array, tuple[Array, ...], Impulses]:
     """Velocity and impulses with which the rows of mechanisms hold exactly.
 
     Args:
@@ -342,18 +378,22 @@ def hold(
       joint_rows: all joint rows.
       velocity: (component, block, world) with the impulses so far.
       impulses: of all groups, those of the joints first.
+      known: change of the impulses of the links; None if it is not known yet.
+
+    Returns:
+      Velocity, impulses, and the change.
     """
     tables = [group.table for group in joint_rows]
     slot_count = sum(int((table.order != EMPTY).sum()) for table in tables)
     bias = collect(tables, [group.bias[:, 0] for group in joint_rows], slot_count)
     wanted = jax.tree.map(lambda rate, bias: -(rate + bias), rates(links, velocity), of_slots(links, bias))
-    change = solve(links, wanted)
+    change = solve(links, wanted, known)
     of_all = to_slots(links, change, slot_count)
     new = [
         impulse + pack_scalars(table, [select(table, of_all)], of_all.shape[-1])
         for table, impulse in zip(tables, impulses[: len(tables)], strict=True)
     ]
-    return velocity + push(links, change), (*new, *impulses[len(tables) :])
+    return velocity + push(links, change), (*new, *impulses[len(tables) :]), change
 
 
 def _of_parents(found: Layout, values: Any) -> Any:

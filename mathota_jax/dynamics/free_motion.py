@@ -100,6 +100,7 @@ def rotate_at_constant_momentum(
 def _rotation_vector(inverse: Vec3, start: Vec3, dt: Array) -> Vec3:
     """Rotation vector of a step for the momentum `start`, both along the principal axes at its start."""
 
+    @jax.checkpoint
     def rate(theta: Vec3) -> Vec3:
         theta = _within_half_turn(theta)
         omega = componentwise(inverse, _turn_back(theta, start))
@@ -157,7 +158,7 @@ def _within_half_turn(theta: Vec3) -> Vec3:
     """The rotation vector, shortened to half a turn: beyond it the series say nothing, and would overflow."""
     squared = dot(theta, theta)
     far = squared > math.pi**2
-    return theta * jnp.where(far, math.pi / safe_sqrt(jnp.where(far, squared, 1.0)), 1.0)
+    return theta * lax.stop_gradient(jnp.where(far, math.pi / safe_sqrt(jnp.where(far, squared, 1.0)), 1.0))
 
 
 def _turn_back(theta: Vec3, v: Vec3) -> Vec3:

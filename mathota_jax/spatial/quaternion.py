@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
@@ -37,10 +38,33 @@ def rotate(q: Quaternion, v: Vec3) -> Vec3:
     return v + twice * q.w + cross(axis, twice)
 
 
+@jax.custom_jvp
 def normalize(q: Quaternion) -> Quaternion:
     """Projects back to the unit sphere. Undefined (NaN) for the zero quaternion, which the flags report."""
-    inverse = 1.0 / jnp.sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z)
-    return Quaternion(q.w * inverse, q.x * inverse, q.y * inverse, q.z * inverse)
+    return _scaled(q, _inverse_length(q))
+
+
+@normalize.defjvp
+def _normalize_jvp(primals: tuple[Quaternion], tangents: tuple[Quaternion]) -> tuple[Quaternion, Quaternion]:
+    # In terms of the result: the derivatives of root and quotient would each store quotients of their own.
+    (q,), (change,) = primals, tangents
+    inverse = _inverse_length(q)
+    unit = _scaled(q, inverse)
+    along = _inner(unit, change)
+    across = Quaternion(*(c - u * along for c, u in zip(change, unit, strict=True)))
+    return unit, _scaled(across, inverse)
+
+
+def _inverse_length(q: Quaternion) -> Any:
+    return 1.0 / jnp.sqrt(_inner(q, q))
+
+
+def _inner(p: Quaternion, q: Quaternion) -> Any:
+    return p.w * q.w + p.x * q.x + p.y * q.y + p.z * q.z
+
+
+def _scaled(q: Quaternion, factor: Any) -> Quaternion:
+    return Quaternion(q.w * factor, q.x * factor, q.y * factor, q.z * factor)
 
 
 def to_matrix(q: Quaternion) -> Mat3:
@@ -62,18 +86,34 @@ def to_matrix(q: Quaternion) -> Mat3:
 
 
 def exponential(rotation_vector: Vec3) -> Quaternion:
-    """Quaternion of a rotation vector [rad]; smooth at zero.
-
-    Below a quarter turn squared of 1e-6 the series of sin(t)/t and cos(t) is exact to float64 round-off of the result.
-    """
-    quarter = 0.25 * dot(rotation_vector, rotation_vector)  # square of the half angle
-    small = quarter < 1e-6
-    half = jnp.sqrt(jnp.where(small, 1.0, quarter))
-    sinc = jnp.where(small, 1.0 - quarter * (1.0 / 6.0 - quarter / 120.0), jnp.sin(half) / half)
-    cosine = jnp.where(small, 1.0 - quarter * (0.5 - quarter / 24.0), jnp.cos(half))
+    """Quaternion of a rotation vector [rad]; smooth at zero."""
+    quarter = 0.25 * dot(rotation_vector, rotation_vector)
     # Each serves several components; trigonometry is worth doing once.
-    scale, cosine = compute_once((0.5 * sinc, cosine), quarter)
+    cosine, scale = compute_once(_cosine_and_scale(quarter), quarter)
     return Quaternion(cosine, rotation_vector.x * scale, rotation_vector.y * scale, rotation_vector.z * scale)
+
+
+@jax.custom_jvp
+def _cosine_and_scale(squared: Any) -> tuple[Any, Any]:
+    """``cos(t)`` and ``sin(t) / (2 t)`` of half an angle t, from its square.
+
+    Below 1e-6 their series are exact to float64 round-off.
+    """
+    small = squared < 1e-6
+    half = jnp.sqrt(jnp.where(small, 1.0, squared))
+    scale = jnp.where(small, 0.5 - squared * (1.0 / 12.0 - squared / 240.0), 0.5 * (jnp.sin(half) / half))
+    return jnp.where(small, 1.0 - squared * (0.5 - squared / 24.0), jnp.cos(half)), scale
+
+
+@_cosine_and_scale.defjvp
+def _cosine_and_scale_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+    # Of the values themselves, where they do not cancel: below, the series is exact to float64 round-off as well.
+    (squared,), (change,) = primals, tangents
+    cosine, scale = _cosine_and_scale(squared)
+    small = squared < 1e-2
+    series = 1.0 / 12.0 - squared * (1.0 / 120.0 - squared * (1.0 / 3360.0 - squared / 181440.0))
+    slope = jnp.where(small, -series, 0.25 * (cosine - 2.0 * scale) / jnp.where(small, 1.0, squared))
+    return (cosine, scale), (-scale * change, slope * change)
 
 
 def logarithm(q: Quaternion) -> Vec3:

@@ -6,6 +6,7 @@ sees branch A, the next one branch B. The cure: reduce a discrete choice to one 
 operation that XLA never copies (a division) and cannot fold away, and select every output from the result.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -74,21 +75,44 @@ def store_cotangents(values: Any, *, for_one_reader: bool = False) -> Any:
         for_one_reader: Whether also from a kernel that alone reads it, such as that of the rows that a selection pads (see
             `materialize`).
     """
-    return jax.tree.map(lambda x: _store_cotangent_p.bind(x, for_one_reader=for_one_reader), values)
+    leaves, tree = jax.tree.flatten(values)
+    return jax.tree.unflatten(tree, _store_cotangents_p.bind(*leaves, for_one_reader=for_one_reader))
 
 
-def _transpose_store_cotangent(cotangent: Any, array: Any, *, for_one_reader: bool) -> list[Any]:
-    if type(cotangent) is ad.Zero:
-        return [ad.Zero(array.aval)]
-    return [materialize(cotangent) if for_one_reader else store(cotangent, cotangent)]
+def _jvp_store_cotangents(
+    primals: Sequence[Array], tangents: Sequence[Any], *, for_one_reader: bool
+) -> tuple[list[Array], list[Any]]:
+    found = list(tangents)
+    places = [place for place, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
+    stored = _store_cotangents_p.bind(*(tangents[place] for place in places), for_one_reader=for_one_reader)
+    for place, tangent in zip(places, stored, strict=True):
+        found[place] = tangent
+    return list(primals), found
 
 
-_store_cotangent_p = Primitive("store_cotangent")
-_store_cotangent_p.def_impl(lambda array, **_: array)
-_store_cotangent_p.def_abstract_eval(lambda array, **_: ShapedArray(array.shape, array.dtype))
-ad.deflinear2(_store_cotangent_p, _transpose_store_cotangent)
-batching.defvectorized(_store_cotangent_p)
-mlir.register_lowering(_store_cotangent_p, mlir.lower_fun(lambda array, **_: array, multiple_results=False))
+def _transpose_store_cotangents(cotangents: Sequence[Any], *arrays: Any, for_one_reader: bool) -> list[Any]:
+    found = [ad.Zero(array.aval) if type(c) is ad.Zero else c for c, array in zip(cotangents, arrays, strict=True)]
+    places = [place for place, cotangent in enumerate(found) if type(cotangent) is not ad.Zero]
+    shapes = {found[place].shape for place in places}
+    # Those of one shape together: a conditional has its price.
+    groups = [[place for place in places if found[place].shape == shape] for shape in sorted(shapes)]
+    for group in groups if for_one_reader else []:
+        for place, stored in zip(group, materialize([found[place] for place in group]), strict=True):
+            found[place] = stored
+    return found if for_one_reader else [store(c, c) if place in places else c for place, c in enumerate(found)]
+
+
+_store_cotangents_p = Primitive("store_cotangents")
+_store_cotangents_p.multiple_results = True
+_store_cotangents_p.def_impl(lambda *arrays, **_: list(arrays))
+_store_cotangents_p.def_abstract_eval(lambda *arrays, **_: [ShapedArray(x.shape, x.dtype) for x in arrays])
+ad.primitive_jvps[_store_cotangents_p] = _jvp_store_cotangents
+ad.primitive_transposes[_store_cotangents_p] = _transpose_store_cotangents
+batching.primitive_batchers[_store_cotangents_p] = lambda args, axes, **params: (
+    _store_cotangents_p.bind(*args, **params),
+    list(axes),
+)
+mlir.register_lowering(_store_cotangents_p, mlir.lower_fun(lambda *arrays, **_: list(arrays), multiple_results=True))
 
 
 def materialize(values: Any) -> Any:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Hinge, Options, Plane, SceneBuilder, Sphere, step
+from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, step
 from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.step import step_worlds_last
 from tests.scenes import box_stack, slab_on_plane, with_dt
@@ -28,7 +28,28 @@ def pushed_slab():
     return with_dt(model, 1 / 240), state
 
 
+def swinging_chain(**features):
+    """Three links, the last of which turns fast; with `features` of the joints, its mechanism is not alone."""
+    builder = SceneBuilder()
+    parent = builder.add_body(Sphere(0.01), static=True)
+    for index in range(3):
+        child = builder.add_body(
+            Box((0.1, 0.02, 0.03)),
+            mass=0.2 + 0.1 * index,
+            position=(0.1 + 0.2 * index, 0, 0),
+            angular_velocity=(0, 0, float(index)),
+            velocity=(0, 0.1 * index, 0),
+            collides=False,
+        )
+        joint = Hinge(parent=parent, child=child, anchor=(0.2 * index, 0, 0), axis=(0, 0.6, 0.8), **features)
+        builder.add_joint(joint)
+        parent = child
+    return builder.build()
+
+
 SCENES = {
+    "chain": swinging_chain,
+    "damped chain": lambda: swinging_chain(damping=0.01, limits=(-0.01, 1.0)),
     "slab": pushed_slab,
     "stack": lambda: box_stack(2),
     "hinge": hinged_balls,
