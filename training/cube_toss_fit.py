@@ -43,6 +43,9 @@ FITTED = ("friction", "restitution", "inertia", "corner_radius")
 UNCERTAINTY = np.array([0.05, 0.2, 0.05, 0.05, 0.05, 0.25])
 """How far, as shares, the numbers of `FITTED` may be off: the unit of steps."""
 
+FIRST_HORIZONS = (30, 60)
+"""Frames (0.2 s, 0.4 s) that the stages before it see: about the first impact, and the next ones."""
+
 WEIGHTS = (1 / 11.0, 1 / 13.0)
 """Of position [%] and rotation [degree] errors: about as much of each."""
 
@@ -59,7 +62,7 @@ def fit_tosses(tosses: Tosses, settings: Sequence[str], steps: int = 12) -> list
     """Fits the cube, for each setting.
 
     Rest tells the size, free flights the centre of mass, the first impacts roughly the rest, and whole motions all that
-    impacts tell: each stage begins where the one before ended.
+    impacts tell, over longer and longer horizons: each stage begins where the one before ended.
     """
     first = first_guess(tosses)
     result = fit_first_impacts(tosses, first)
@@ -67,9 +70,23 @@ def fit_tosses(tosses: Tosses, settings: Sequence[str], steps: int = 12) -> list
     begin = first._replace(friction=friction, restitution=restitution, inertia=first.inertia * factor)
     interval = (float(result.lower[0]), float(result.upper[0]))
     return [
-        Estimate(refine(tosses, start_of(tosses, setting, begin), begin, HORIZON, steps), friction, interval)
+        Estimate(fit_whole_motions(tosses, start_of(tosses, setting, begin), begin, steps), friction, interval)
         for setting in settings
     ]
+
+
+def fit_whole_motions(tosses: Tosses, start: Start, begin: CubeParameters, steps: int) -> CubeParameters:
+    """The parameters of least mean errors, from given ones, as `refine` finds them.
+
+    Whole motions alone lead to one of many minima: after several impacts a small change is felt as another face. A first
+    stage over fewer frames leads near the right one; of several such stages the one is taken that ends with the least
+    errors, of these tosses.
+    """
+    found = []
+    for horizon in FIRST_HORIZONS:
+        near = refine(tosses, start, begin, horizon, steps)
+        found.append(refine(tosses, start, near, HORIZON, steps))
+    return min(found, key=lambda parameters: mean_errors(tosses, start, parameters, HORIZON))
 
 
 def first_guess(tosses: Tosses) -> CubeParameters:
@@ -118,6 +135,13 @@ def first_impacts(tosses: Tosses, known: CubeParameters) -> Trajectories:
     return Trajectories(("cube",), tosses.dt, **channels)
 
 
+def mean_errors(tosses: Tosses, start: Start, parameters: CubeParameters, horizon: int) -> float:
+    """Weighted sum of the mean errors of position and rotation over some frames; infinite where they are not finite."""
+    found = prediction_errors(tosses, start, parameters, min(horizon, tosses.position.shape[1] - 1))
+    total = sum(weight * error.mean() for weight, error in zip(WEIGHTS, found, strict=True))
+    return float(total) if np.isfinite(total) else np.inf
+
+
 def refine(tosses: Tosses, start: Start, begin: CubeParameters, horizon: int, steps: int) -> CubeParameters:
     """The parameters of least mean errors, near given ones.
 
@@ -137,12 +161,7 @@ def refine(tosses: Tosses, start: Start, begin: CubeParameters, horizon: int, st
     share = seen / seen.sum(1, keepdims=True) / tosses.count
     start = as_arrays(model, start)
 
-    def objective(parameters: CubeParameters) -> float:
-        found = prediction_errors(tosses, start, parameters, horizon)
-        total = sum(weight * error.mean() for weight, error in zip(WEIGHTS, found, strict=True))
-        return float(total) if np.isfinite(total) else np.inf
-
-    best, damping = objective(begin), 1e-2
+    best, damping = mean_errors(tosses, start, begin, horizon), 1e-2
     for _ in range(steps):
         errors, slopes = _linearise(model, state, as_arrays(model, begin), start, recorded, 2 * tosses.half_width)
         matrix, gradient = _normal_equations(np.asarray(errors, float), np.asarray(slopes, float), share)
@@ -150,7 +169,7 @@ def refine(tosses: Tosses, start: Start, begin: CubeParameters, horizon: int, st
         while damping < 1e3:
             change = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
             other = _moved(begin, np.clip(change, -1.0, 1.0) * UNCERTAINTY)
-            found = objective(other)
+            found = mean_errors(tosses, start, other, horizon)
             if found < best:
                 begin, best, damping = other, found, damping / 4
                 break
