@@ -91,7 +91,9 @@ def _jvp_store_cotangents(
 
 
 def _transpose_store_cotangents(cotangents: Sequence[Any], *arrays: Any, for_one_reader: bool) -> list[Any]:
-    found = [ad.Zero(array.aval) if type(c) is ad.Zero else c for c, array in zip(cotangents, arrays, strict=True)]
+    found: list[Any] = [
+        ad.Zero(array.aval) if type(c) is ad.Zero else c for c, array in zip(cotangents, arrays, strict=True)
+    ]
     places = [place for place, cotangent in enumerate(found) if type(cotangent) is not ad.Zero]
     shapes = {found[place].shape for place in places}
     # Those of one shape together: a conditional has its price.
