@@ -259,7 +259,7 @@ def close_joints(
         return displace(moved, inertia, shift), impulses
 
     rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
-    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model)))
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model, known)))
     moved = in_every_world(moved, worlds)
     if known is not None:
         # Nothing is left to be found that it would be cheaper to store than to compute again.

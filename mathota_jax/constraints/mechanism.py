@@ -247,6 +247,8 @@ def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impu
 
     Where they are `known`, derivatives are computed without finding them again.
     """
+    leaves = (*wanted, *(known or ()), links.factors.offset, links.offset.x)
+    wanted, known = in_every_world((wanted, known), max(leaf.shape[-1] for leaf in leaves))
     if known is not None:
         return _known_solution(links, wanted, known)
 
@@ -257,8 +259,6 @@ def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impu
             for flags, change, impulse in zip(links.layout.held, changes, impulses, strict=True)
         )
 
-    worlds = max(leaf.shape[-1] for leaf in (*wanted, links.factors.offset, links.offset.x))
-    wanted = tuple(jnp.broadcast_to(values, (values.shape[0], worlds)) for values in wanted)
     return lax.custom_linear_solve(product, wanted, lambda _, right: _impulses(links, right), symmetric=True)
 
 

@@ -86,6 +86,21 @@ def test_derivatives_are_those_of_a_step_that_solves_again(float64, name):
     assert np.abs(known[0]).max() > 0.1
 
 
+@pytest.mark.parametrize("name", ["chain", "damped chain"])
+def test_forward_mode_in_worlds_that_share_the_motion(float64, name):
+    """Directions, and worlds that differ in their flags alone, share what the mechanism's solver found."""
+    model, state = SCENES[name]()
+
+    def cost(velocity, flags):
+        new = step(model, dataclasses.replace(state, velocity=velocity, flags=flags))
+        return (new.velocity * jnp.arange(1.0, 4.0)).sum() + (new.position**2).sum() + new.angular_velocity.sum()
+
+    flags = jnp.zeros(2, state.flags.dtype)
+    forward = jax.jit(jax.vmap(jax.jacfwd(cost), (None, 0)))(state.velocity, flags)
+    truth = jax.jit(jax.grad(cost))(state.velocity, flags[0])
+    np.testing.assert_allclose(forward, np.stack([truth] * 2), rtol=1e-8, atol=1e-10 * np.abs(truth).max())
+
+
 @jax.custom_jvp
 def known_exponential(known, x):
     return known
