@@ -17,6 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, mlir
 
 from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
 from mathota_jax.constraints.assembly import Side, collect, pack_scalars, select
@@ -250,7 +253,8 @@ def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impu
     leaves = (*wanted, *(known or ()), links.factors.offset, links.offset.x)
     wanted, known = in_every_world((wanted, known), max(leaf.shape[-1] for leaf in leaves))
     if known is not None:
-        return _known_solution(links, wanted, known)
+        leaves, tree = jax.tree.flatten((links, wanted, known))
+        return tuple(_known_solution_p.bind(*leaves, tree=tree))
 
     def product(impulses: Impulses) -> Impulses:
         changes = rates(links, push(links, _held(links, impulses)))
@@ -262,19 +266,33 @@ def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impu
     return lax.custom_linear_solve(product, wanted, lambda _, right: _impulses(links, right), symmetric=True)
 
 
-@jax.custom_jvp
-def _known_solution(links: Links, wanted: Impulses, known: Impulses) -> Impulses:
-    del links, wanted
-    return known
+def _known_solution(*leaves: Array, tree: Any) -> list[Array]:
+    return list(jax.tree.unflatten(tree, leaves)[2])
 
 
-@_known_solution.defjvp
-def _known_solution_jvp(primals: tuple, tangents: tuple) -> tuple[Impulses, Impulses]:
-    links, wanted, known = primals
-    found = _known_solution(links, wanted, known)
-    changes = jax.jvp(lambda links: rates(links, push(links, found)), (links,), (tangents[0],))[1]
-    right = _held(links, jax.tree.map(jnp.subtract, tangents[1], changes))
-    return found, solve(links, right)
+def _known_solution_jvp(
+    primals: Sequence[Array], tangents: Sequence[Any], *, tree: Any
+) -> tuple[list[Array], list[Array]]:
+    links, wanted, known = jax.tree.unflatten(tree, primals)
+    changed = [ad.instantiate_zeros(tangent) for tangent in tangents]
+    d_links, d_wanted, _ = jax.tree.unflatten(tree, changed)
+    # Whatever is differentiated again depends on links and wanted rates too.
+    found = solve(links, wanted, known)
+    changes = jax.jvp(lambda links: rates(links, push(links, found)), (links,), (d_links,))[1]
+    right = _held(links, jax.tree.map(jnp.subtract, d_wanted, changes))
+    return list(found), list(solve(links, right))
+
+
+# A primitive: a `custom_jvp` loses its rule where JAX splits a program into what is known and what is linear, and with it
+# the second derivatives.
+_known_solution_p = Primitive("known_solution")
+_known_solution_p.multiple_results = True
+_known_solution_p.def_impl(_known_solution)
+_known_solution_p.def_abstract_eval(
+    lambda *leaves, tree: [ShapedArray(x.shape, x.dtype) for x in _known_solution(*leaves, tree=tree)]
+)
+ad.primitive_jvps[_known_solution_p] = _known_solution_jvp
+mlir.register_lowering(_known_solution_p, mlir.lower_fun(_known_solution, multiple_results=True))
 
 
 def _impulses(links: Links, wanted: Impulses) -> Impulses:

@@ -101,6 +101,31 @@ def test_forward_mode_in_worlds_that_share_the_motion(float64, name):
     np.testing.assert_allclose(forward, np.stack([truth] * 2), rtol=1e-8, atol=1e-10 * np.abs(truth).max())
 
 
+def test_second_derivatives_through_a_joint(float64):
+    """The Hessian is symmetric, and equals central differences of the gradient: what is known still depends on the state."""
+    builder = SceneBuilder()
+    pivot = builder.add_body(Sphere(0.01), static=True)
+    rod = builder.add_body(Box((0.1, 0.02, 0.03)), mass=0.3, position=(0.1, 0, 0), collides=False)
+    builder.add_joint(Hinge(parent=pivot, child=rod, anchor=(0, 0, 0), axis=(0, 0.6, 0.8)))
+    model, state = builder.build()
+
+    def cost(spin):
+        new = step(model, dataclasses.replace(state, angular_velocity=state.angular_velocity.at[rod].set(spin)))
+        return (
+            100 * (new.position[rod] ** 3).sum()
+            + (new.velocity[rod] ** 2).sum()
+            + (new.angular_velocity[rod] ** 3).sum()
+        )
+
+    gradient, spin, change = jax.grad(cost), jnp.asarray([0.1, 0.8, 1.0]), 1e-5
+    points = jnp.concatenate([spin + change * jnp.eye(3), spin - change * jnp.eye(3)])
+    around = jax.jit(jax.vmap(gradient))(points)
+    truth = (around[:3] - around[3:]) / (2 * change)
+    hessian = jax.jit(jax.jacfwd(gradient))(spin)
+    np.testing.assert_allclose(hessian, truth, atol=1e-8 * np.abs(truth).max())
+    np.testing.assert_allclose(hessian, hessian.T, atol=1e-12 * np.abs(truth).max())
+
+
 @jax.custom_jvp
 def known_exponential(known, x):
     return known
