@@ -14,7 +14,7 @@ from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
 from mathota_jax.constraints.lever import levers
 from mathota_jax.constraints.mechanism import Solutions
-from mathota_jax.constraints.mechanism_layout import layout, takes_small_steps
+from mathota_jax.constraints.mechanism_layout import takes_small_steps
 from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
@@ -178,6 +178,7 @@ def _simulate(
     if not scene.dynamic_bodies:
         return new_state(scene, state, moving(scene, bodies), {}), None
     known, mechanisms = solved_before or (None, None)
+    held, closed = mechanisms or (None, None)
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
     acting, halfway = acting_inertia(model, blocks, inertia)
@@ -189,12 +190,11 @@ def _simulate(
         start, change = known_impulses(model, problem, known), None
     else:
         start, change = starting_impulses(model, state, problem, acting, packed)
-    lever, beyond, gained, failed, last, held, closed = None, None, None, None, None, None, None
+    lever, beyond, gained, failed, last = None, None, None, None, None
     small = takes_small_steps(scene)
     if small:
         solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
-        held = None if mechanisms is None else mechanisms.held
         solved, impulses, failed, held = solve_rows(scene, problem, packed, start, change, known is not None, held)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(
@@ -206,7 +206,7 @@ def _simulate(
     if scene.options.continuous and scene.pair_groups:
         moved = stop_at_impacts(model, bodies, moved, displacement)
     if problem.held is not None:
-        moved, closed = close_joints(model, bodies, moved, None if mechanisms is None else mechanisms.closed)
+        moved, closed = close_joints(model, bodies, moved, closed)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
     if last is not None and state.end_forces is not None:
         new = dataclasses.replace(new, end_forces=end_forces(model, problem, state.end_forces, last))
@@ -221,9 +221,8 @@ def _reusable(result: tuple[State, Solutions | None], model: Model, state: State
     if mechanisms is not None:
         return Solved(None, mechanisms)
     options = model.scene.options
-    # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts;
-    # mechanisms are solved directly.
-    if options.sleep or options.impact_events or options.solver == "soft_step" or layout(model.scene) is not None:
+    # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts.
+    if options.sleep or options.impact_events or options.solver == "soft_step":
         return None
     return Solved(Forces(new.joint_force, new.contact_force), None)
 

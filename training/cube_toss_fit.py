@@ -31,6 +31,9 @@ WINDOW = 12
 HORIZON = 148
 """Frames (1 s) that the last stage sees: later ones the cube mostly lies still."""
 
+FIRST_HORIZONS = (30, 60)
+"""Frames (0.2 s, 0.4 s) that the stages before it see: about the first impact, and the next ones."""
+
 PUBLISHED = {"friction": 0.18, "restitution": 0.125, "inertia": np.full(3, 8.1e-4)}
 """Values published with the data, where the fit begins."""
 
@@ -42,9 +45,6 @@ FITTED = ("friction", "restitution", "inertia", "corner_radius")
 
 UNCERTAINTY = np.array([0.05, 0.2, 0.05, 0.05, 0.05, 0.25])
 """How far, as shares, the numbers of `FITTED` may be off: the unit of steps."""
-
-FIRST_HORIZONS = (30, 60)
-"""Frames (0.2 s, 0.4 s) that the stages before it see: about the first impact, and the next ones."""
 
 WEIGHTS = (1 / 11.0, 1 / 13.0)
 """Of position [%] and rotation [degree] errors: about as much of each."""

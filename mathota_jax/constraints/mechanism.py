@@ -250,8 +250,8 @@ def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impu
 
     Where they are `known`, derivatives are computed without finding them again.
     """
-    leaves = (*wanted, *(known or ()), links.factors.offset, links.offset.x)
-    wanted, known = in_every_world((wanted, known), max(leaf.shape[-1] for leaf in leaves))
+    worlds = max(leaf.shape[-1] for leaf in (*wanted, *(known or ()), links.factors.offset, links.offset.x))
+    wanted, known = in_every_world((wanted, known), worlds)
     if known is not None:
         leaves, tree = jax.tree.flatten((links, wanted, known))
         return tuple(_known_solution_p.bind(*leaves, tree=tree))
@@ -273,11 +273,10 @@ def _known_solution(*leaves: Array, tree: Any) -> list[Array]:
 def _known_solution_jvp(
     primals: Sequence[Array], tangents: Sequence[Any], *, tree: Any
 ) -> tuple[list[Array], list[Array]]:
-    links, wanted, known = jax.tree.unflatten(tree, primals)
-    changed = [ad.instantiate_zeros(tangent) for tangent in tangents]
-    d_links, d_wanted, _ = jax.tree.unflatten(tree, changed)
-    # Whatever is differentiated again depends on links and wanted rates too.
-    found = solve(links, wanted, known)
+    links = jax.tree.unflatten(tree, primals)[0]
+    d_links, d_wanted, _ = jax.tree.unflatten(tree, [ad.instantiate_zeros(tangent) for tangent in tangents])
+    # Not `known` itself, which is constant: this depends on the links and wanted rates when it is differentiated again.
+    found = tuple(_known_solution_p.bind(*primals, tree=tree))
     changes = jax.jvp(lambda links: rates(links, push(links, found)), (links,), (d_links,))[1]
     right = _held(links, jax.tree.map(jnp.subtract, d_wanted, changes))
     return list(found), list(solve(links, right))

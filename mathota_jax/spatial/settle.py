@@ -95,13 +95,16 @@ def _transpose_store_cotangents(cotangents: Sequence[Any], *arrays: Any, for_one
         ad.Zero(array.aval) if type(c) is ad.Zero else c for c, array in zip(cotangents, arrays, strict=True)
     ]
     places = [place for place, cotangent in enumerate(found) if type(cotangent) is not ad.Zero]
-    shapes = {found[place].shape for place in places}
+    if not for_one_reader:
+        for place in places:
+            found[place] = store(found[place], found[place])
+        return found
     # Those of one shape together: a conditional has its price.
-    groups = [[place for place in places if found[place].shape == shape] for shape in sorted(shapes)]
-    for group in groups if for_one_reader else []:
+    for shape in sorted({found[place].shape for place in places}):
+        group = [place for place in places if found[place].shape == shape]
         for place, stored in zip(group, materialize([found[place] for place in group]), strict=True):
             found[place] = stored
-    return found if for_one_reader else [store(c, c) if place in places else c for place, c in enumerate(found)]
+    return found
 
 
 _store_cotangents_p = Primitive("store_cotangents")
