@@ -10,6 +10,8 @@ takes a function written for arrays with one *trailing* world axis and turns it 
   keeps of the result (so reverse mode stores one set of inputs per call and recomputes the rest);
 * transpose calls the VJP of the function, in the same layout.
 
+On CPUs large batches may be computed some worlds at a time (`spatial.world_parts`), which lowering decides.
+
 Both primitives carry any function, so the rules close over themselves: derivatives of any order, in any order with
 `vmap`, `scan`, `checkpoint` and `jit`. `jax.custom_batching.custom_vmap` cannot serve: its `vmap(grad)` fails.
 """
@@ -27,11 +29,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.core import ShapedArray
-from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
-Native = Callable[..., Any]
-"""Function of arrays with one trailing world axis each (of common size, or 1) to a pytree of such, hashable."""
+from mathota_jax.spatial.world_parts import by_parts, part_size, parts_pay
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,13 +51,17 @@ class Shortcut:
     function: Callable[..., Any]
 
 
-def batch_last(function: Callable[..., Any], shortcut: Shortcut | None = None) -> Callable[..., Any]:
+def batch_last(
+    function: Callable[..., Any], shortcut: Shortcut | None = None, in_parts: bool = False
+) -> Callable[..., Any]:
     """Makes a natural-shaped function of a worlds-last one.
 
     Args:
       function: pure function of pytrees. Every array it receives has its natural axes followed by ONE world axis, whose
         size is the number of worlds or 1 (argument shared by all worlds); every array it returns likewise.
       shortcut: how derivatives compute it again; None for as it is.
+      in_parts: whether large batches are computed in parts that stay in the cache, on CPUs and where it pays. Not for what
+        is done in few numbers for each world: of some hundred, kernels take longer to launch than to run.
 
     Returns:
       Function of the same pytrees without the world axis. Differentiable wherever `function` is; `jax.vmap` of it runs
@@ -67,7 +72,7 @@ def batch_last(function: Callable[..., Any], shortcut: Shortcut | None = None) -
     def natural(*args: Any) -> Any:
         leaves, in_tree = jax.tree.flatten(args)
         leaves = [jnp.asarray(leaf) for leaf in leaves]
-        native = TreeFunction(function, in_tree, shortcut)
+        native = TreeFunction(function, in_tree, shortcut, in_parts)
         out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
         return jax.tree.unflatten(_out_tree(native, _natural_signatures(leaves, 0)), out_leaves)
 
@@ -81,6 +86,7 @@ class TreeFunction:
     function: Callable[..., Any]
     in_tree: Any
     shortcut: Shortcut | None = None
+    in_parts: bool = False
 
     def __call__(self, *leaves: Array) -> Any:
         return self.function(*jax.tree.unflatten(self.in_tree, leaves))
@@ -89,7 +95,8 @@ class TreeFunction:
         """The function by its shortcut, and the arrays that it needs before the arguments."""
         args = jax.tree.unflatten(self.in_tree, leaves)
         kept = shortcut.keep(result, *args)
-        return TreeFunction(shortcut.function, jax.tree.structure((kept, *args))), jax.tree.leaves(kept)
+        function = TreeFunction(shortcut.function, jax.tree.structure((kept, *args)), in_parts=self.in_parts)
+        return function, jax.tree.leaves(kept)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,6 +135,10 @@ class Pullback:
         return list(pull([_cotangent_of(output, c) for output, c in zip(outputs, cotangents, strict=True)]))
 
 
+Native = TreeFunction | Pushforward | Pullback
+"""Function of arrays with one trailing world axis each (of common size, or 1) to a pytree of such."""
+
+
 def _cotangent_of(output: Array, cotangent: Array) -> Array:
     """The cotangent in the shape of its output; one that all worlds share depends on nothing that is differentiated."""
     shared = output.shape[-1] < cotangent.shape[-1]
@@ -154,12 +165,11 @@ Signature = tuple[tuple[int, ...], Any]
 
 def _run(native: Native, args: Sequence[Array]) -> list[Array]:
     """The leaves of the result; shape inference, lowering and derivatives share one trace of the function."""
-    signatures = tuple((arg.shape, arg.dtype) for arg in args)
-    return _traced(native, signatures, _trace_context())(*args)
+    return jaxpr_as_fun(_traced(native, tuple((arg.shape, arg.dtype) for arg in args), _trace_context()))(*args)
 
 
 @functools.lru_cache(maxsize=512)
-def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[Any, ...]) -> Callable[..., list[Array]]:
+def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[Any, ...]) -> ClosedJaxpr:
     """`native` as a program for arguments of the given shapes and types.
 
     The cache of `jit` does not serve: it forgets between a trace and its lowering, whose contexts differ.
@@ -169,7 +179,7 @@ def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[An
     # Behind `jit`, so that whoever calls the program binds one equation instead of each.
     program, result = jax.make_jaxpr(jax.jit(lambda *args: native(*args)), return_shape=True)(*shapes)
     _known_out_tree(native, tuple((shape[:-1], dtype) for shape, dtype in signatures))[:] = [jax.tree.structure(result)]
-    return jaxpr_as_fun(program)
+    return program
 
 
 def _trace_context() -> tuple[Any, ...]:
@@ -193,15 +203,45 @@ def _out_tree(native: Native, natural: tuple[Signature, ...]) -> Any:
     return known[0]
 
 
-def _evaluate(*args: Array, native: Native, world_axes: int) -> list[Array]:
+def _evaluate(*args: Array, native: Native, world_axes: int, on_cpu: bool = False) -> list[Array]:
     """Calls `native` on arrays with any number of trailing world axes, merging them into one."""
-    worlds = np.broadcast_shapes(*(arg.shape[arg.ndim - world_axes :] for arg in args)) if world_axes else ()
-    outputs = _run(native, [_merge_worlds(arg, worlds) for arg in args])
+    worlds = _worlds(args, world_axes)
+    merged = [_merge_worlds(arg, worlds) for arg in args]
+    run = functools.partial(_run, native)
+    parts = on_cpu and _parts_pay(native, merged)
+    outputs = by_parts(run, merged, _part_size(native, merged)) if parts else run(merged)
     shapes = (output.shape[:-1] for output in outputs)
     return [
         jnp.broadcast_to(output, (*shape, math.prod(worlds))).reshape(*shape, *worlds)
         for output, shape in zip(outputs, shapes, strict=True)
     ]
+
+
+def _worlds(args: Sequence[Any], world_axes: int) -> tuple[int, ...]:
+    return np.broadcast_shapes(*(arg.shape[arg.ndim - world_axes :] for arg in args)) if world_axes else ()
+
+
+def _parts_pay(native: Native, args: Sequence[Any]) -> bool:
+    """Whether a batch is better cut into parts, for `native` or a derivative of it."""
+    size = _part_size(native, args)
+    if size == max(arg.shape[-1] for arg in args):
+        return False
+    native, args = _primal(native, args)
+    return parts_pay(_traced(native, _signatures(args, size), _trace_context()), size)
+
+
+def _part_size(native: Native, args: Sequence[Any]) -> int:
+    """Worlds of the parts into which a batch may be cut."""
+    worlds = max(arg.shape[-1] for arg in args)
+    primal, of_primal = _primal(native, args)
+    return part_size(worlds, of_primal) if primal.in_parts else worlds
+
+
+def _primal(native: Native, args: Sequence[Any]) -> tuple[TreeFunction, Sequence[Any]]:
+    """The function of which `native` may be a derivative, and its arguments."""
+    while not isinstance(native, TreeFunction):
+        native, args = native.native, args[: len(native.mask)]
+    return native, args
 
 
 def _merge_worlds(arg: Array, worlds: tuple[int, ...]) -> Array:
@@ -215,15 +255,39 @@ def _natural_signatures(avals: Sequence[Any], world_axes: int) -> tuple[Signatur
     return tuple((aval.shape[: aval.ndim - world_axes], aval.dtype) for aval in avals)
 
 
+def _signatures(args: Sequence[Any], worlds: int) -> tuple[Signature, ...]:
+    """Of arguments with one world axis, for so many worlds."""
+    return tuple(((*arg.shape[:-1], worlds if arg.shape[-1] > 1 else 1), arg.dtype) for arg in args)
+
+
 def _abstract_evaluation(*avals: Any, native: Native, world_axes: int) -> list[Any]:
-    shapes = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
-    outputs = jax.eval_shape(functools.partial(_evaluate, native=native, world_axes=world_axes), *shapes)
-    return [ShapedArray(output.shape, output.dtype) for output in outputs]
+    worlds = _worlds(avals, world_axes)
+    shapes = (jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals)
+    merged = [jax.eval_shape(lambda arg: _merge_worlds(arg, worlds), shape) for shape in shapes]
+    return [ShapedArray((*shape, *worlds), dtype) for shape, dtype in _natural_results(native, merged)]
+
+
+def _natural_results(native: Native, args: Sequence[Any]) -> list[Signature]:
+    """Shapes and types of the results for a world.
+
+    The function is traced for as many worlds as it is likely to be lowered for.
+    """
+    if isinstance(native, Pullback):
+        return [
+            (arg.shape[:-1], arg.dtype)
+            for arg, selected in zip(args[: len(native.mask)], native.mask, strict=True)
+            if selected
+        ]
+    if isinstance(native, Pushforward):
+        found = _natural_results(native.native, args[: len(native.mask)])
+        return [(shape, dtype) for shape, dtype in found if jnp.issubdtype(dtype, jnp.inexact)]
+    program = _traced(native, _signatures(args, _part_size(native, args)), _trace_context())
+    return [(aval.shape[:-1], aval.dtype) for aval in program.out_avals]
 
 
 @functools.lru_cache(maxsize=512)
 def _compiled(native: Native, world_axes: int) -> Callable[..., list[Array]]:
-    return jax.jit(functools.partial(_evaluate, native=native, world_axes=world_axes))
+    return jax.jit(functools.partial(_call_p.bind, native=native, world_axes=world_axes))
 
 
 def _implementation(*args: Array, native: Native, world_axes: int) -> list[Array]:
@@ -261,8 +325,10 @@ def _jvp_rule(
     return outputs, [next(real) if _is_real(output) else zero for output, zero in zip(outputs, zeros, strict=True)]
 
 
-def _linear_evaluate(*args: Array, native: Native, mask: tuple[bool, ...], world_axes: int) -> list[Array]:
-    return _evaluate(*args, native=Pushforward(native, mask), world_axes=world_axes)
+def _linear_evaluate(
+    *args: Array, native: Native, mask: tuple[bool, ...], world_axes: int, on_cpu: bool = False
+) -> list[Array]:
+    return _evaluate(*args, native=Pushforward(native, mask), world_axes=world_axes, on_cpu=on_cpu)
 
 
 def _linear_implementation(*args: Array, native: Native, mask: tuple[bool, ...], world_axes: int) -> list[Array]:
@@ -305,6 +371,9 @@ _call_p.def_abstract_eval(_abstract_evaluation)
 batching.primitive_batchers[_call_p] = functools.partial(_batching_rule, _call_p)
 ad.primitive_jvps[_call_p] = _jvp_rule
 mlir.register_lowering(_call_p, mlir.lower_fun(_evaluate, multiple_results=True))
+mlir.register_lowering(
+    _call_p, mlir.lower_fun(functools.partial(_evaluate, on_cpu=True), multiple_results=True), platform="cpu"
+)
 
 _linear_p = Primitive("batch_last_linear")
 _linear_p.multiple_results = True
@@ -314,3 +383,6 @@ batching.primitive_batchers[_linear_p] = functools.partial(_batching_rule, _line
 ad.primitive_jvps[_linear_p] = _linear_jvp_rule
 ad.primitive_transposes[_linear_p] = _linear_transpose_rule
 mlir.register_lowering(_linear_p, mlir.lower_fun(_linear_evaluate, multiple_results=True))
+mlir.register_lowering(
+    _linear_p, mlir.lower_fun(functools.partial(_linear_evaluate, on_cpu=True), multiple_results=True), platform="cpu"
+)

@@ -25,7 +25,7 @@ from mathota_jax.geometry.hull import padded_faces
 from mathota_jax.geometry.leaves import Geometry
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize, to_matrix
-from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.settle import materialize, settle
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, where
 
 ADVANCES = 32
@@ -282,15 +282,11 @@ def _deepest(found: Manifold) -> Nearest:
 
 def _natural(nearest: Nearest) -> ClosestPoints:
     worlds = np.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(nearest)))
-
-    def vector(v: Vec3) -> Array:
-        return jnp.stack([jnp.broadcast_to(component, worlds)[0] for component in v])
-
-    separation = jnp.broadcast_to(nearest.separation, worlds)[0]
+    # Stored first, or each coordinate of each point is computed from the poses by itself, a world at a time.
+    separation, *vectors = materialize(jax.tree.map(lambda x: jnp.broadcast_to(x, worlds)[0], nearest[:4]))
+    normal, point_a, point_b = map(jnp.stack, vectors)
     converged = jnp.ones(worlds, bool) if nearest.converged is None else jnp.broadcast_to(nearest.converged, worlds)
-    return ClosestPoints(
-        separation, vector(nearest.normal), vector(nearest.point_a), vector(nearest.point_b), converged[0]
-    )
+    return ClosestPoints(separation, normal, point_a, point_b, converged[0])
 
 
 @batch_last

@@ -231,4 +231,4 @@ def _step_again(solved: Solved | None, model: Model, state: State, action: Array
     return _solve_step(model, state, action, solved)
 
 
-_batched_step = batch_last(_solve_step, Shortcut(_reusable, _step_again))
+_batched_step = batch_last(_solve_step, Shortcut(_reusable, _step_again), in_parts=True)

@@ -26,12 +26,18 @@ def following(counter: Array) -> Array:
     return counter + jnp.array([1, 0, 0, 0], jnp.int32)
 
 
+def index(counter: Array) -> Array:
+    """The counter as one number."""
+    first, second, third, fourth = unstack(counter, 0)
+    return first + second + third + fourth
+
+
 def row(tree: Any, counter: Array) -> Any:
     """Rows of the arrays (row, ...) of a pytree at the counter, without that axis."""
-    index = _index(counter)
+    place = index(counter)
 
     def slice_of(values: Array) -> Array:
-        corner = (index, *[jnp.int32(0)] * (values.ndim - 1))
+        corner = (place, *[jnp.int32(0)] * (values.ndim - 1))
         found = lax.dynamic_slice(values, corner, (1, *values.shape[1:]), allow_negative_indices=False)
         return jnp.squeeze(found, 0)
 
@@ -40,10 +46,5 @@ def row(tree: Any, counter: Array) -> Any:
 
 def put(array: Array, value: Array, counter: Array) -> Array:
     """The array with its row at the counter replaced."""
-    corner = (_index(counter), *[jnp.int32(0)] * value.ndim)
+    corner = (index(counter), *[jnp.int32(0)] * value.ndim)
     return lax.dynamic_update_slice(array, value[None], corner, allow_negative_indices=False)
-
-
-def _index(counter: Array) -> Array:
-    first, second, third, fourth = unstack(counter, 0)
-    return first + second + third + fourth

@@ -60,7 +60,7 @@ def test_short_run_writes_everything(backend, tmp_path, capsys):
     assert train.main(arguments) == 0
     printed = capsys.readouterr().out
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["steps"] == (320 if backend == "gradient" else 240)  # whole rollouts: 5 of 64 steps
+    assert metrics["steps"] == (256 if backend == "gradient" else 240)  # whole updates: 4 of 64 steps
     assert metrics["evaluation"]["episodes"] == 2
     assert 1 <= metrics["evaluation"]["mean_return"] <= 1000
     assert metrics["evaluation"]["mean_length"] >= metrics["evaluation"]["mean_return"]
