@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.core import eval_jaxpr
 
 from mathota_jax.spatial import counter
 
@@ -31,7 +32,6 @@ def map_filled(function: Callable[[Any], Any], tree: Any, filled: Array) -> Any:
     chunk_count = _chunk_count(count)
     size = math.ceil(count / chunk_count)
     padding = chunk_count * size - count
-    evaluate = jax.jit(function)  # traced once, for its shapes and for its values
 
     def split(values: Array) -> Array:
         if padding:
@@ -39,15 +39,28 @@ def map_filled(function: Callable[[Any], Any], tree: Any, filled: Array) -> Any:
         return values.reshape(chunk_count, size, *values.shape[1:])
 
     chunks = jax.tree.map(split, tree)
-    example = jax.tree.map(lambda x: x[0], chunks)
-    converted, constants = jax.closure_convert(evaluate, example)
-    results = _map_chunks(converted, constants, chunks, -(-filled // size))
+    evaluate, constants = _without_closure(function, jax.tree.map(lambda x: x[0], chunks))
+    results = _map_chunks(evaluate, constants, chunks, -(-filled // size))
 
     def join(values: Array) -> Array:
         rows_of_one = values.shape[1] // size
         return values.reshape(-1, *values.shape[2:])[: count * rows_of_one]
 
     return jax.tree.map(join, results)
+
+
+def _without_closure(function: Callable[[Any], Any], example: Any) -> tuple[Callable[..., Any], list[Array]]:
+    """The function with all arrays that it closes over as further arguments, and those arrays.
+
+    `jax.closure_convert` leaves integers behind, which a custom derivative inside a loop then looks for in vain.
+    """
+    program, result = jax.make_jaxpr(jax.jit(function), return_shape=True)(example)
+
+    def converted(rows: Any, *constants: Array) -> Any:
+        leaves = eval_jaxpr(program.jaxpr, constants, *jax.tree.leaves(rows))
+        return jax.tree.unflatten(jax.tree.structure(result), leaves)
+
+    return converted, program.consts
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

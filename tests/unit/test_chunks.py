@@ -55,3 +55,27 @@ def test_empty_rows_are_not_evaluated():
     value, derivative = jax.value_and_grad(lambda x: map_filled(bad_where_zero, x, jnp.int32(9)).sum())(x)
     assert value == 9
     assert np.isfinite(np.asarray(derivative)).all()
+
+
+def test_what_the_function_closes_over_has_derivatives_too():
+    """Numbers and places, in reverse mode through a loop."""
+    rows = jnp.arange(12.0)
+
+    def total(weight, places):
+        def body(carry, _):
+            weight_now, places_now = jnp.cos(carry) * weight, places + 1
+            found = map_filled(lambda x: x * weight_now[places_now], rows, jnp.int32(12))
+            return carry + found.sum(), None
+
+        return jax.lax.scan(body, jnp.zeros(()), None, length=2)[0]
+
+    def derivative(weight, places):
+        _, pull = jax.vjp(jax.jit(lambda weight: total(weight, places)), weight)
+        return pull(jnp.ones(()))[0]
+
+    weight, places = jnp.asarray([5.0, 0.02]), jnp.zeros((), jnp.int32)
+    s = float(rows.sum())
+    # c_1 = s w, c_2 = c_1 + s w cos(c_1)
+    inner = 0.02 * s
+    expected = s + s * np.cos(inner) - inner * s * np.sin(inner)
+    np.testing.assert_allclose(jax.jit(derivative)(weight, places), [0.0, expected], rtol=1e-5)
