@@ -26,16 +26,19 @@ from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis, where
 
-POLYTOPE_STEPS, CURVED_STEPS = 4, 8
+POLYTOPE_STEPS, CURVED_STEPS = 4, 12
 """Most Newton steps; all lanes stop as soon as they have converged."""
 LONGEST_STEP = 0.5
 """Newton steps turn the normal by at most this angle [rad]; a longer one means that the pieces are not the right ones."""
 ROUNDING = 16.0
 """Separations that differ by fewer round-offs of the size are equal."""
-LEAST_WEIGHT = 0.01
-"""A tied piece pair of less than minus this weight does not hold the others back from the solution, and leaves."""
 ASIDE = 1e-7
 """Closest points this far [size] beside the normal do not lie along it; in float32 some round-offs more."""
+ASCENT = 0.2
+"""Where the separation of the tied pieces has no maximum nearby, the normal turns by this angle [rad] the way it grows,
+until another piece undercuts them."""
+TIED = 64.0
+"""Points whose heights over a flat end differ by fewer units of `ROUNDING` lie on a face that is parallel to it."""
 STIFFNESS_ROUNDING = 64.0
 """A stiffness below this many round-offs leaves the normal where it is."""
 
@@ -92,10 +95,19 @@ def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
     points = _tied_points(shapes, ties, normal)
     weights = barycentric(_differences(points), ties.two, ties.three)
     lowest = lax.stop_gradient(jnp.minimum(weights[0], jnp.minimum(weights[1], weights[2])))
+    point_a, point_b = (combine(weights, list(of_shape)) for of_shape in zip(*points, strict=True))
+    if _curved(shapes):
+        # Around the axis of a rim its points turn faster than a Newton step knows: what the search found is close enough.
+        lost = ~solution.exact & (solution.separation > 0)
+        searched_a, searched_b = _searched_points(shapes, simplex)
+        point_a, point_b = where(lost, searched_a, point_a), where(lost, searched_b, point_b)
+        # A rim seen almost along its axis turns the round-off of the normal into a hundred times that along the rim.
+        middle, half_gap = (point_a + point_b) * 0.5, normal * (0.5 * dot(normal, point_b - point_a))
+        point_a, point_b = middle - half_gap, middle + half_gap
     result = Closest(
         normal,
-        combine(weights, [a for a, _ in points]),
-        combine(weights, [b for _, b in points]),
+        point_a,
+        point_b,
         ties,
         solution.exact,
         lowest >= -rounding,
@@ -105,6 +117,15 @@ def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
         if SUPPORT[kind].rim_radius is not None:
             result, best = _flat_end(shapes, simplex, result, best, bool(of_b), rounding)
     return result
+
+
+def _searched_points(shapes: Difference, simplex: Simplex) -> tuple[Vec3, Vec3]:
+    """Closest points that the search found, each carried along by its shape."""
+    assert simplex.point_a is not None
+    assert simplex.point_b is not None
+    frozen = lax.stop_gradient(shapes)
+    local = frozen.rotation.apply_transposed(simplex.point_b - frozen.position)
+    return simplex.point_a, shapes.position + shapes.rotation.apply(local)
 
 
 @jax.custom_jvp
@@ -170,10 +191,10 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
         ties = _join(state.ties, pieces, weights, ~exact)
         if not curved:
             return _Search(state.turn + 1, normal, ties, best, state.left, state.done | exact)
-        ties, leaves = _leave(ties, weights, exact)
+        ties, leaves = _leave(ties, weights, rounding, exact)
         return _Search(state.turn + 1, normal, ties, best, state.left | leaves, state.done | (exact & still & ~leaves))
 
-    curved = any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
+    curved = _curved(shapes)
     extreme, pieces = shapes.least(simplex.direction)
     reach = dot(simplex.direction, extreme)
     first = Solution(simplex.direction, reach, _single(pieces), jnp.zeros(reach.shape, bool))
@@ -182,6 +203,11 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
     )
     steps = CURVED_STEPS if curved else POLYTOPE_STEPS
     return lax.while_loop(lambda s: (s.turn < steps) & ~jnp.all(s.done), advance, state).best
+
+
+def _curved(shapes: Difference) -> bool:
+    """Whether one of the shapes has a rim."""
+    return any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
 
 
 def _rounding(shapes: Difference) -> float:
@@ -198,12 +224,15 @@ def _join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
     return Ties((first, second, third), ties.two | (slot == 1), ties.three | (slot == 2))
 
 
-def _leave(ties: Ties, weights: Weights, wanted: Array) -> tuple[Ties, Array]:
-    """Takes out the tied piece pair beyond which the closest point lies, and tells whether there was one."""
+def _leave(ties: Ties, weights: Weights, rounding: float, wanted: Array) -> tuple[Ties, Array]:
+    """Takes out the tied piece pair beyond which the closest point lies, and tells whether there was one.
+
+    It has a negative weight: it does not hold the others back from the solution.
+    """
     third = jnp.where(ties.three, weights[2], jnp.inf)
     weights = weights[0], jnp.where(ties.two, weights[1], jnp.inf), third
     slot = _lightest(weights)
-    beyond = wanted & (jnp.minimum(weights[0], jnp.minimum(weights[1], third)) < -LEAST_WEIGHT)
+    beyond = wanted & (jnp.minimum(weights[0], jnp.minimum(weights[1], third)) < -rounding)
     slot = settle_code(jnp.where(beyond, slot, -1).astype(third.dtype))
     first, second, third = ties.pieces
     pieces = jnp.where(slot == 0, second, first), jnp.where((slot == 0) | (slot == 1), third, second), third
@@ -299,9 +328,10 @@ def _step(shapes: Difference, ties: Ties, normal: Vec3, points: list[Vec3]) -> V
     stiffness = separation + sum(k * dot(t, tangent) ** 2 for t, k in curvatures)
     coupling = sum(k * dot(t, tangent) * dot(t, along) for t, k in curvatures)
     force = dot(tangent, middle) - coupling * alpha
-    firm = ties.two & (jnp.abs(stiffness) > STIFFNESS_ROUNDING * eps)
+    firm = ties.two & (stiffness > STIFFNESS_ROUNDING * eps)
     beta = jnp.where(firm, force / jnp.where(firm, stiffness, 1.0), 0.0)
-    line = along * alpha + tangent * beta
+    firm &= jnp.abs(beta) < LONGEST_STEP
+    line = along * alpha + tangent * jnp.where(firm, beta, _climb(force, stiffness))
 
     # One: stationary in both tangent directions.
     basis = tangent_basis(normal)
@@ -311,16 +341,41 @@ def _step(shapes: Difference, ties: Ties, normal: Vec3, points: list[Vec3]) -> V
     k12 = sum((k * dot(t, basis[0]) * dot(t, basis[1]) for t, k in curvatures), jnp.zeros_like(separation))
     determinant = k11 * k22 - k12 * k12
     scale = jnp.abs(k11) + jnp.abs(k22)
-    firm = jnp.abs(determinant) > STIFFNESS_ROUNDING * eps * jnp.maximum(scale, STIFFNESS_ROUNDING * eps) * scale
+    firm = determinant > STIFFNESS_ROUNDING * eps * jnp.maximum(scale, STIFFNESS_ROUNDING * eps) * scale
+    firm &= scale == k11 + k22
     inverse = jnp.where(firm, 1.0 / jnp.where(firm, determinant, 1.0), 0.0)
-    spot = basis[0] * ((k22 * force_1 - k12 * force_2) * inverse) + basis[1] * (
-        (k11 * force_2 - k12 * force_1) * inverse
-    )
+    change_1, change_2 = (k22 * force_1 - k12 * force_2) * inverse, (k11 * force_2 - k12 * force_1) * inverse
+    firm &= change_1 * change_1 + change_2 * change_2 < LONGEST_STEP**2
+    climb_1, climb_2 = _climb_in_plane(force_1, force_2, k11, k12, k22)
+    spot = basis[0] * jnp.where(firm, change_1, climb_1) + basis[1] * jnp.where(firm, change_2, climb_2)
 
-    change = where(ties.two, line, spot)
-    moderate = dot(change, change) < LONGEST_STEP**2
-    moved = where(usable, face, where(moderate, normal + change, normal))
+    moved = where(usable, face, normal + where(ties.two, line, spot))
     return moved * lax.rsqrt(dot(moved, moved))
+
+
+def _climb(force: Array, stiffness: Array) -> Array:
+    """Bounded Newton step towards a maximum, or uphill where the function of the angle has none. No derivative."""
+    force, stiffness = lax.stop_gradient((force, stiffness))
+    eps = float(jnp.finfo(force.dtype).eps)
+    reachable = stiffness * ASCENT > jnp.abs(force)
+    uphill = jnp.where(jnp.abs(force) > ROUNDING * eps, jnp.sign(force) * ASCENT, 0.0)
+    return jnp.where(reachable, force / jnp.where(reachable, stiffness, 1.0), uphill)
+
+
+def _climb_in_plane(force_1: Array, force_2: Array, k11: Array, k12: Array, k22: Array) -> tuple[Array, Array]:
+    """`_climb` along both eigenvectors of a stiffness."""
+    force_1, force_2, k11, k12, k22 = lax.stop_gradient((force_1, force_2, k11, k12, k22))
+    half = 0.5 * (k11 - k22)
+    spread = jnp.sqrt(half * half + k12 * k12)
+    cosine = jnp.where(
+        spread > 0, half / jnp.where(spread > 0, spread, 1.0), 1.0
+    )  # of twice the angle of the stiffer one
+    x = jnp.sqrt(jnp.maximum(0.5 + 0.5 * cosine, 0.0))
+    y = jnp.sqrt(jnp.maximum(0.5 - 0.5 * cosine, 0.0)) * jnp.where(k12 < 0, -1.0, 1.0)
+    middle = 0.5 * (k11 + k22)
+    stiff = _climb(x * force_1 + y * force_2, middle + spread)
+    soft = _climb(x * force_2 - y * force_1, middle - spread)
+    return x * stiff - y * soft, y * stiff + x * soft
 
 
 def _flat_end(
@@ -338,18 +393,28 @@ def _flat_end(
     along = _reach(frozen, lax.stop_gradient(normal))
     # Off the axis the separation falls with the angle itself, so a near tie means that the end is flat on something.
     # Half the round-off: two evaluations of the same separation were seen to differ by three epsilons.
-    chosen = settle_code((along >= best - rounding / 2.0).astype(best.dtype)) == 1
+    level = along >= best - rounding / 2.0
 
     pieces = frozen.pieces(lax.stop_gradient(normal))
     point_a, point_b = shapes.points(pieces, normal)
     other, searched = (point_a, simplex.point_a) if of_b else (point_b, simplex.point_b)
     assert searched is not None
     offset = searched - lax.stop_gradient(other)
-    tied = jnp.abs(dot(lax.stop_gradient(normal), offset)) <= 64.0 * rounding
+    # Closer by, points of a curved rim are as extreme; the search knows them less well than their formula does.
+    tied = (jnp.abs(dot(lax.stop_gradient(normal), offset)) <= TIED * rounding) & (
+        dot(offset, offset) > 4.0 * TIED * rounding
+    )
     offset = offset * jnp.where(tied, 1.0, 0.0)
     if not of_b:  # carried along by B; A is at rest in its own frame
         offset = shapes.rotation.apply(lax.stop_gradient(shapes.rotation).apply_transposed(offset))
     other = other + offset
+    # A point just beyond the rim is as far from the end as from the rim, to round-off; but the end does not reach so far.
+    beside = lax.stop_gradient(shapes.rotation.apply_transposed(other - shapes.position) if of_b else other)
+    rim_radius = SUPPORT[shapes.kind_b if of_b else shapes.kind_a].rim_radius
+    assert rim_radius is not None
+    radius = rim_radius(frozen.b if of_b else frozen.a, pieces % CODES if of_b else pieces // CODES)
+    over = beside.x * beside.x + beside.z * beside.z <= (radius + 4.0 * rounding) ** 2
+    chosen = settle_code((level & over).astype(best.dtype)) == 1
     gap = dot(normal, point_b - point_a)
     point_a, point_b = (other, other + normal * gap) if of_b else (other - normal * gap, other)
     return (

@@ -23,6 +23,7 @@ from mathota_jax.collision.convex.gjk import Simplex, gjk
 from mathota_jax.collision.convex.polish import Solution, Ties, solve
 from mathota_jax.collision.convex.polytope import Polytope
 from mathota_jax.collision.convex.separating_axis import separating_axis
+from mathota_jax.collision.convex.support import SUPPORT, Parameters
 from mathota_jax.spatial.vector import Vec3, dot, where
 
 POLYTOPE_ITERATIONS = 16
@@ -34,6 +35,8 @@ PROOFS = 3
 """Proofs in a row: each starts from what the one before found in place of its seed."""
 SEEDS = [d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)]
 """Directions in the frame of A among which the first local minimum is looked for, besides the axes of B."""
+SIDES = 8
+"""Normals of each round side among those."""
 LIFT = 0.01
 """Overlapping shapes are pulled apart to this gap (share of the size)."""
 LIFT_RATIO = {"float32": 0.3, "float64": 0.01}
@@ -175,7 +178,22 @@ def _glance(shapes: Difference) -> tuple[Vec3, Array]:
     like = shapes.position.x
     ours = [Vec3(*(jnp.full_like(like, c / math.hypot(*d)) for c in d)) for d in SEEDS]
     theirs = [axis * sign for axis in shapes.rotation for sign in (1.0, -1.0)]
-    directions = Vec3(*(jnp.stack(components) for components in zip(*ours, *theirs, strict=True)))
+    sides = [
+        *_side_normals(shapes.kind_a, shapes.a),
+        *(-shapes.rotation.apply(n) for n in _side_normals(shapes.kind_b, shapes.b)),
+    ]
+    stored = (jnp.broadcast_arrays(*components) for components in zip(*ours, *theirs, *sides, strict=True))
+    directions = Vec3(*(jnp.stack(components) for components in stored))
     extreme, _ = shapes.least(directions)
     separation, index = best_candidate(dot(directions, extreme))
     return pick(directions, index), -separation
+
+
+def _side_normals(kind: str, shape: Parameters) -> list[Vec3]:
+    """Some normals of the round side of a shape, in its own frame."""
+    side = SUPPORT[kind].side
+    if side is None:
+        return []
+    across, along = side(shape)
+    angles = [2.0 * math.pi * k / SIDES for k in range(SIDES)]
+    return [Vec3(across * math.cos(angle), along, across * math.sin(angle)) for angle in angles]

@@ -37,6 +37,7 @@ class Support(NamedTuple):
         extent: Upper bound [m] of the distance of core points from the origin.
         rim_radius: Radius [m] of the circle that is a given piece (0 where it is a point); None for shapes without.
         inflation: Radius [m] added around the core; None where there is none.
+        side: Parts of the unit normal of the round side away from the y axis and along it; None without a round side.
     """
 
     code: Callable[[Parameters, Vec3], Array]
@@ -44,6 +45,7 @@ class Support(NamedTuple):
     extent: Callable[[Parameters], Array]
     rim_radius: Callable[[Parameters, Array], Array] | None = None
     inflation: Callable[[Parameters], Array] | None = None
+    side: Callable[[Parameters], tuple[Array, Array]] | None = None
 
 
 def support(kind: str, shape: Parameters, direction: Vec3) -> tuple[Vec3, Array]:
@@ -122,6 +124,17 @@ def _cone_rim(shape: Parameters, code: Array) -> Array:
     return jnp.where(code == 1, 0.0, shape["radius"])
 
 
+def _cylinder_side(shape: Parameters) -> tuple[Array, Array]:
+    zero = jnp.zeros_like(shape["radius"])
+    return zero + 1.0, zero
+
+
+def _cone_side(shape: Parameters) -> tuple[Array, Array]:
+    height, radius = 2.0 * shape["half_height"], shape["radius"]
+    inverse = lax.rsqrt(height * height + radius * radius)
+    return height * inverse, radius * inverse
+
+
 def _polyhedron_code(shape: Parameters, direction: Vec3) -> Array:
     vertices = shape["vertices"]
     count = vertices.x.shape[0]
@@ -192,8 +205,12 @@ SUPPORT: dict[str, Support] = {
     "sphere": Support(_sphere_code, _sphere_point, lambda s: 0.0 * s["radius"], inflation=_radius),
     "capsule": Support(_upward, _capsule_point, lambda s: s["half_height"], inflation=_radius),
     "box": Support(_box_code, _box_point, lambda s: norm(s["half_extents"])),
-    "cylinder": Support(_upward, _cylinder_point, lambda s: s["radius"] + s["half_height"], _cylinder_rim),
-    "cone": Support(_cone_code, _cone_point, lambda s: s["radius"] + 1.5 * s["half_height"], _cone_rim),
+    "cylinder": Support(
+        _upward, _cylinder_point, lambda s: s["radius"] + s["half_height"], _cylinder_rim, side=_cylinder_side
+    ),
+    "cone": Support(
+        _cone_code, _cone_point, lambda s: s["radius"] + 1.5 * s["half_height"], _cone_rim, side=_cone_side
+    ),
     "polyhedron": Support(_polyhedron_code, _polyhedron_point, _polyhedron_extent),
 }
 """Registry: kind -> support function."""
