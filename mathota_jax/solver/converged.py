@@ -68,8 +68,10 @@ LARGEST_STIFFNESS = {"float32": 1e6, "float64": 1e9}
 """The linear system loses the mass of a body beside a stiffness near the inverse of round-off."""
 
 MEASURE = 1e3
-"""Stiffness of the laws by which residuals are measured: that many times less counts an error of an impulse, whose round-off
-beside a light body is large, than the velocity that it stands for."""
+"""Stiffness of the laws by which velocities are measured: rows that stick count as they move, those that slide as little."""
+
+ROUNDING = 8.0
+"""Round-offs by which impulses may differ from those of the laws. Beside a light body they stand for much velocity."""
 
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
 """Residual at which a world is done, relative to the largest velocity or constraint error of the unconstrained motion."""
@@ -188,10 +190,13 @@ class _Problem:
     def residual(self, impulses: Impulses, errors: Impulses) -> Array:
         """Largest distance (world,) of impulses from those that the laws ask for."""
         parts = []
+        rounding = ROUNDING * float(jnp.finfo(self.free.dtype).eps)
         for group, old, error, weight in zip(self.rows, impulses, errors, self.weights, strict=True):
             law = stiffen(group.law, jnp.full(1, MEASURE, error.dtype))
-            mass = jnp.broadcast_to(masses(law), old.shape)
-            parts.append(weight * safe_divide(jnp.abs(law.change(old, error)), mass))
+            moves = safe_divide(jnp.abs(law.change(old, error)), jnp.broadcast_to(masses(law), old.shape))
+            wrong = jnp.abs(group.law.change(old, error)) - rounding * jnp.abs(old).max(1, keepdims=True)
+            lacks = safe_divide(jnp.maximum(wrong, 0.0), jnp.broadcast_to(masses(group.law), old.shape))
+            parts.append(weight * jnp.maximum(moves, lacks))
         return _largest(parts, self.free)
 
     def project(self, stiffness: Array, centre: Impulses, errors: Impulses) -> Impulses:

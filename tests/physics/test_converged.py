@@ -61,6 +61,28 @@ def test_a_stack_of_ten_boxes_does_not_move(precision, gate):
     assert not np.asarray(final.flags).any()
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_fast_ball_slides_and_then_rolls(precision, gate):
+    """Friction is many times smaller than what moves: it must still be that of the law, and end where the ball rolls."""
+    speeds, friction, radius, dt = np.array([0.5, 5.0, 50.0]), 0.2, 0.1, 1 / 240
+    worlds = []
+    for speed in speeds:
+        builder = SceneBuilder(gravity=DOWN)
+        builder.add_body(Plane((0, 1, 0)), static=True, friction=friction)
+        builder.add_body(Sphere(radius), mass=1.0, position=(0, radius, 0), velocity=(speed, 0, 0), friction=friction)
+        worlds.append(builder.build(converged(dt=dt)))
+    models, states = stack([m for m, _ in worlds]), stack([s for _, s in worlds])
+    steps = 20
+    final = advance_worlds(models, states, steps)
+    sliding = speeds[1:] - friction * GRAVITY * steps * dt
+    gate("speed while it slides / closed form - 1", final.velocity[1:, 1, 0] / sliding - 1, 1e-5)
+    final = advance_worlds(models, final, round(8.0 / dt))
+    rolling = speeds / 1.4
+    gate("rolling speed / closed form - 1", final.velocity[:, 1, 0] / rolling - 1, 1e-4)
+    gate("spin / closed form - 1", -final.angular_velocity[:, 1, 2] * radius / rolling - 1, 1e-4)
+    assert not np.asarray(final.flags).any()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [20, 40])
 def test_tall_stacks_stand(float64, count, gate):
