@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import CODES, Difference, difference
-from mathota_jax.collision.convex.polish import Closest, Ties, polish, solve
+from mathota_jax.collision.convex.polish import Closest, polish, solve
 from mathota_jax.collision.convex.polytope import are_polytopes, polytope
 from mathota_jax.collision.convex.search import search_curved, search_polytopes
 from mathota_jax.collision.convex.support import SUPPORT
+from mathota_jax.collision.convex.ties import Ties
 from mathota_jax.collision.polyhedron import TOPOLOGY
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import compute_once

@@ -22,6 +22,7 @@ from jax import Array, lax
 from mathota_jax.collision.convex.difference import CODES, Difference, Weights, barycentric, combine
 from mathota_jax.collision.convex.gjk import Simplex
 from mathota_jax.collision.convex.support import SUPPORT
+from mathota_jax.collision.convex.ties import Ties, distinct, join, leave, single
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis, where
@@ -41,14 +42,6 @@ TIED = 64.0
 """Points whose heights over a flat end differ by fewer units of `ROUNDING` lie on a face that is parallel to it."""
 STIFFNESS_ROUNDING = 64.0
 """A stiffness below this many round-offs leaves the normal where it is."""
-
-
-class Ties(NamedTuple):
-    """Distinct piece pairs that are extreme at once: the first always, the others where `two`, `three`."""
-
-    pieces: tuple[Array, ...]
-    two: Array
-    three: Array
 
 
 class Closest(NamedTuple):
@@ -188,16 +181,16 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
         here = Solution(normal, reach, state.ties, exact)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), here, best)
         still = dot(turned, turned) <= rounding * rounding
-        ties = _join(state.ties, pieces, weights, ~exact)
+        ties = join(state.ties, pieces, weights, ~exact)
         if not curved:
             return _Search(state.turn + 1, normal, ties, best, state.left, state.done | exact)
-        ties, leaves = _leave(ties, weights, rounding, exact)
+        ties, leaves = leave(ties, weights, rounding, exact)
         return _Search(state.turn + 1, normal, ties, best, state.left | leaves, state.done | (exact & still & ~leaves))
 
     curved = _curved(shapes)
     extreme, pieces = shapes.least(simplex.direction)
     reach = dot(simplex.direction, extreme)
-    first = Solution(simplex.direction, reach, _single(pieces), jnp.zeros(reach.shape, bool))
+    first = Solution(simplex.direction, reach, single(pieces), jnp.zeros(reach.shape, bool))
     state = _Search(
         jnp.zeros((), jnp.int32), simplex.direction, distinct(simplex.pieces), first, wanted & ~wanted, ~wanted
     )
@@ -212,45 +205,6 @@ def _curved(shapes: Difference) -> bool:
 
 def _rounding(shapes: Difference) -> float:
     return ROUNDING * float(jnp.finfo(shapes.position.x.dtype).eps)
-
-
-def _join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
-    """Adds a piece pair; of three tied ones it replaces the one of the least weight."""
-    first, second, third = ties.pieces
-    wanted = wanted & (pieces != first) & ~(ties.two & (pieces == second)) & ~(ties.three & (pieces == third))
-    slot = jnp.where(ties.three, _lightest(weights), jnp.where(ties.two, 2, 1))
-    slot = settle_code(jnp.where(wanted, slot, -1).astype(weights[0].dtype))
-    first, second, third = (jnp.where(slot == k, pieces, old) for k, old in enumerate((first, second, third)))
-    return Ties((first, second, third), ties.two | (slot == 1), ties.three | (slot == 2))
-
-
-def _leave(ties: Ties, weights: Weights, rounding: float, wanted: Array) -> tuple[Ties, Array]:
-    """Takes out the tied piece pair beyond which the closest point lies, and tells whether there was one.
-
-    It has a negative weight: it does not hold the others back from the solution.
-    """
-    third = jnp.where(ties.three, weights[2], jnp.inf)
-    weights = weights[0], jnp.where(ties.two, weights[1], jnp.inf), third
-    slot = _lightest(weights)
-    beyond = wanted & (jnp.minimum(weights[0], jnp.minimum(weights[1], third)) < -rounding)
-    slot = settle_code(jnp.where(beyond, slot, -1).astype(third.dtype))
-    first, second, third = ties.pieces
-    pieces = jnp.where(slot == 0, second, first), jnp.where((slot == 0) | (slot == 1), third, second), third
-    leaves = slot >= 0
-    return Ties(pieces, jnp.where(leaves, ties.three, ties.two), ties.three & ~leaves), leaves
-
-
-def _lightest(weights: Weights) -> Array:
-    return jnp.where(weights[0] <= jnp.minimum(weights[1], weights[2]), 0, jnp.where(weights[1] <= weights[2], 1, 2))
-
-
-def distinct(pieces: tuple[Array, ...]) -> Ties:
-    """Sorts out repeated piece pairs (different points of one rim)."""
-    first, second, third = pieces
-    repeated = second == first
-    second, third = jnp.where(repeated, third, second), jnp.where(repeated, first, third)
-    two = second != first
-    return Ties((first, second, third), two, two & (third != first) & (third != second))
 
 
 def _reach(shapes: Difference, direction: Vec3) -> Array:
@@ -367,9 +321,8 @@ def _climb_in_plane(force_1: Array, force_2: Array, k11: Array, k12: Array, k22:
     force_1, force_2, k11, k12, k22 = lax.stop_gradient((force_1, force_2, k11, k12, k22))
     half = 0.5 * (k11 - k22)
     spread = jnp.sqrt(half * half + k12 * k12)
-    cosine = jnp.where(
-        spread > 0, half / jnp.where(spread > 0, spread, 1.0), 1.0
-    )  # of twice the angle of the stiffer one
+    # Of twice the angle of the stiffer one.
+    cosine = jnp.where(spread > 0, half / jnp.where(spread > 0, spread, 1.0), 1.0)
     x = jnp.sqrt(jnp.maximum(0.5 + 0.5 * cosine, 0.0))
     y = jnp.sqrt(jnp.maximum(0.5 - 0.5 * cosine, 0.0)) * jnp.where(k12 < 0, -1.0, 1.0)
     middle = 0.5 * (k11 + k22)
@@ -401,9 +354,8 @@ def _flat_end(
     assert searched is not None
     offset = searched - lax.stop_gradient(other)
     # Closer by, points of a curved rim are as extreme; the search knows them less well than their formula does.
-    tied = (jnp.abs(dot(lax.stop_gradient(normal), offset)) <= TIED * rounding) & (
-        dot(offset, offset) > 4.0 * TIED * rounding
-    )
+    tied = jnp.abs(dot(lax.stop_gradient(normal), offset)) <= TIED * rounding
+    tied &= dot(offset, offset) > 4.0 * TIED * rounding
     offset = offset * jnp.where(tied, 1.0, 0.0)
     if not of_b:  # carried along by B; A is at rest in its own frame
         offset = shapes.rotation.apply(lax.stop_gradient(shapes.rotation).apply_transposed(offset))
@@ -422,14 +374,9 @@ def _flat_end(
             where(chosen, normal, result.normal),
             where(chosen, point_a, result.point_a),
             where(chosen, point_b, result.point_b),
-            jax.tree.map(lambda new, old: jnp.where(chosen, new, old), _single(pieces), result.ties),
+            jax.tree.map(lambda new, old: jnp.where(chosen, new, old), single(pieces), result.ties),
             chosen | result.consistent,
             ~chosen & result.inside,
         ),
         jnp.where(chosen, along, best),
     )
-
-
-def _single(pieces: Array) -> Ties:
-    none = jnp.zeros_like(pieces, dtype=bool)
-    return Ties((pieces, pieces, pieces), none, none)

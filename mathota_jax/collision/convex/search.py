@@ -20,10 +20,11 @@ from mathota_jax.collision.convex.cap import proved_cap
 from mathota_jax.collision.convex.difference import Difference
 from mathota_jax.collision.convex.epa import epa
 from mathota_jax.collision.convex.gjk import Simplex, gjk
-from mathota_jax.collision.convex.polish import Solution, Ties, solve
+from mathota_jax.collision.convex.polish import Solution, solve
 from mathota_jax.collision.convex.polytope import Polytope
 from mathota_jax.collision.convex.separating_axis import separating_axis
 from mathota_jax.collision.convex.support import SUPPORT, Parameters
+from mathota_jax.collision.convex.ties import Ties
 from mathota_jax.spatial.vector import Vec3, dot, where
 
 POLYTOPE_ITERATIONS = 16
