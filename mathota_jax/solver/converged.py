@@ -70,7 +70,7 @@ LARGEST_STIFFNESS = {"float32": 1e6, "float64": 1e9}
 MEASURE = 1e3
 """Stiffness of the laws by which velocities are measured: rows that stick count as they move, those that slide as little."""
 
-ROUNDING = 8.0
+ROUNDING = 32.0
 """Round-offs by which impulses may differ from those of the laws. Beside a light body they stand for much velocity."""
 
 TOLERANCE = {"float32": 1e-5, "float64": 1e-9}
