@@ -41,9 +41,8 @@ def impact(approach: Approach, dt: Array) -> tuple[Array, Array]:
     separation, start = approach.separation, approach.start
     gap = jnp.maximum(separation, 0.0)
     hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(separation <= 0, 1.0, 0.0)) > 0
-    # By the same condition twice: a gap of metres over next to no speed has an infinite derivative, times 0.
-    closes = hits & (start < 0)
-    time = jnp.clip(jnp.where(closes, gap / jnp.where(closes, -start, 1.0), 0.0), 0.0, dt)
+    # Of those that hit: a gap of metres over next to no speed has an infinite derivative, times 0.
+    time = jnp.clip(safe_divide(gap, jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)), 0.0, dt)
     # The gap changes by dt (start + end) / 2, so this end velocity closes it and no more.
     target = jnp.where(hits, 0.0, -2.0 * gap / dt - start)
     stopped = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)

@@ -20,6 +20,9 @@ from mathota_jax.constraints.oscillator import end_weight, oscillator_weights
 LARGEST_DECAY = 30.0
 """Cap on damping * J M^-1 J^T * dt, beyond which the velocity left is below round-off of either precision."""
 
+LEAST = 1e-15
+"""What resists less than this, of the inertia, is no row: it is below round-off, and its softness has infinite derivatives."""
+
 CORRECTED = (HOLD, STOP)
 """Laws whose errors the position correction removes."""
 
@@ -76,7 +79,7 @@ def _viscous(columns: Columns) -> Response:
     """Resistance proportional to the rate."""
     mass, dt = columns.mass, columns.dt
     decay = jnp.clip(columns.coefficients["damping"] * mass * dt, 0.0, LARGEST_DECAY)
-    works = decay > 0
+    works = decay > LEAST
     safe_decay = jnp.where(works, decay, 1.0)
     weight = end_weight(safe_decay)
     return Response(columns.rate * (1.0 / weight - 1.0), mass / (weight * safe_decay), works=works)
@@ -104,7 +107,7 @@ def _oscillator(columns: Columns, rotor: bool) -> Response:
     if rotor:
         inertia = mass * given["armature"]
         at_end, at_start = at_end + inertia, at_start - inertia
-    works = at_end > 0
+    works = at_end > LEAST
     divisor = jnp.where(works, at_end, 1.0)
     error = columns.error - given["target"]
     if columns.angular.any():

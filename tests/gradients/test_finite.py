@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Capsule, Hinge, Plane, SceneBuilder, Slider, Sphere, contacts, energy, rollout
+from mathota_jax import Box, Capsule, Hinge, Plane, SceneBuilder, Slider, Sphere, contacts, energy, rollout, step
 from mathota_jax.constraints.impact import Approach, impact
 from mathota_jax.spatial.vector import Vec3
 from tests.scenes import DOWN, stack, undamped
@@ -15,6 +15,9 @@ from tests.scenes import DOWN, stack, undamped
 HALF = 0.1  # every shape reaches this far below its centre
 
 SHAPES = {"sphere": Sphere(HALF), "box": Box((HALF, HALF, HALF)), "capsule": Capsule(0.04, 0.06)}
+
+TINY = (1e-9, 1e-12, 1e-15, 1e-20, 1e-25, 1e-30, 1e-36)
+"""Speeds of bodies at rest but for round-off."""
 
 EVERYTHING = ("sphere", "sphere", "box", "box", "capsule", "capsule")
 
@@ -80,10 +83,18 @@ def check_every_gradient(kinds, restitution):
     names, centres = zip(*placements(len(kinds)).items(), strict=True)
     free = slice(1, 1 + len(kinds))
     states = stack([dataclasses.replace(state, position=state.position.at[free].set(jnp.asarray(p))) for p in centres])
-    # Moving as well as resting: an impact must not divide by a vanishing approach speed.
-    moving = dataclasses.replace(states, velocity=states.velocity.at[:, free, 1].add(-0.5))
-    states = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), states, moving)
-    names = [f"{name}, {motion}" for motion in ("at rest", "moving down") for name in names]
+    # An impact must not divide by a vanishing approach speed, nor by the square of one that underflows.
+    speeds = (0.0, 0.5, *TINY)
+    moving = [
+        dataclasses.replace(
+            states,
+            velocity=states.velocity.at[:, free, 1].add(-speed),
+            angular_velocity=states.angular_velocity.at[:, free, 2].add(0.0 if speed == 0.5 else -speed),
+        )
+        for speed in speeds
+    ]
+    states = jax.tree.map(lambda *parts: jnp.concatenate(parts), *moving)
+    names = [f"{name}, at {speed:g} m/s" for speed in speeds for name in names]
     weights = [np.random.default_rng(3).normal(size=(model.scene.body_count, size)) for size in (3, 4, 3, 3)]
 
     def loss(model, state, action):
@@ -116,3 +127,29 @@ def test_a_wide_gap_that_hardly_closes(speed):
         return impact(Approach(20.0 * one, -start * one, -start * one, None, gravity), jnp.asarray(0.01))
 
     assert np.isfinite(np.asarray(jax.jacrev(lambda start: jnp.stack(lever(start)))(speed))).all()
+
+
+def test_a_joint_that_hardly_resists():
+    """The softness of a spring, damper or rotor is the reciprocal of what vanishes here; of all, then of each alone."""
+    resisting = ("joint_damping", "joint_stiffness", "joint_armature", "joint_friction")
+    builder = SceneBuilder(gravity=DOWN)
+    ground = builder.add_body(Sphere(0.02), static=True, collides=False)
+    lever = builder.add_body(Box((0.02, 0.1, 0.02)), mass=0.5, position=(0, -0.1, 0), collides=False)
+    builder.add_joint(
+        Hinge(ground, lever, (0, 0, 0), (0, 0, 1), damping=1.0, stiffness=1.0, armature=1.0, friction=1.0, rest=0.1)
+    )
+    model, state = builder.build(undamped(dt=1 / 240))
+
+    def loss(values):
+        changed = dataclasses.replace(
+            model, **{name: value[None] for name, value in zip(resisting, values, strict=True)}
+        )
+        final = step(changed, state)
+        return final.angular_velocity[1, 2] + final.position[1, 0]
+
+    all_small = [[value] * 4 for value in (0.0, *TINY)]
+    one_small = [[value if k == alone else 1.0 for k in range(4)] for alone in range(4) for value in (0.0, *TINY)]
+    values = jnp.array(all_small + one_small)
+    gradient = np.asarray(jax.jit(jax.vmap(jax.grad(loss)))(values))
+    bad = ~np.isfinite(gradient).all(axis=1)
+    assert not bad.any(), f"not finite with {', '.join(resisting)} =\n{np.asarray(values)[bad]}"
