@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
@@ -287,7 +287,12 @@ def _natural_results(native: Native, args: Sequence[Any]) -> list[Signature]:
 
 @functools.lru_cache(maxsize=512)
 def _compiled(native: Native, world_axes: int) -> Callable[..., list[Array]]:
-    return jax.jit(functools.partial(_call_p.bind, native=native, world_axes=world_axes))
+    def call(*args: Array) -> list[Array]:
+        # `jax_debug_nans` calls this again without `jit`, to find the operation that fails.
+        traced = any(isinstance(arg, Tracer) for arg in args)
+        return (_call_p.bind if traced else _evaluate)(*args, native=native, world_axes=world_axes)
+
+    return jax.jit(call)
 
 
 def _implementation(*args: Array, native: Native, world_axes: int) -> list[Array]:

@@ -257,3 +257,18 @@ def test_an_output_that_all_worlds_share_has_no_derivative():
         return contacts(model, dataclasses.replace(state, position=position)).normal
 
     assert not jax.jacrev(normal)(state.position).any()
+
+
+def test_debugging_of_nans_names_them():
+    """`jax_debug_nans` runs a program again without `jit`, which must not end in this very program."""
+    model, state = scene()
+    states = stack([dataclasses.replace(state, velocity=state.velocity.at[1, 0].set(speed)) for speed in (1.0, 3e38)])
+    actions = jnp.zeros((2, 1))
+    with jax.debug_nans(True):
+        advance = jax.vmap(step, in_axes=(None, 0, 0))
+        good = jax.tree.map(lambda leaf: leaf[:1], states)
+        assert np.isfinite(np.asarray(advance(model, good, actions[:1]).position)).all()
+        with pytest.raises(FloatingPointError, match="nan"):
+            advance(model, states, actions)
+        with pytest.raises(FloatingPointError, match="nan"):
+            jax.grad(lambda states: advance(model, states, actions).position.sum(), allow_int=True)(states)
