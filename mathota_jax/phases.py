@@ -16,6 +16,7 @@ from mathota_jax.constraints import (
     joint,
     joint_layout,
     joint_rows,
+    loops,
     mechanism,
     mechanism_rows,
     motor,
@@ -200,7 +201,7 @@ def correct_positions(
     rows: list[Rows] = []
     back = None
     if problem.joints is not None:
-        error = joint_rows.joint_rows(model, merge(scene, bodies, moved)).error
+        error = loops.correctable(model, joint_rows.joint_rows(model, merge(scene, bodies, moved)).error)
         bounded = () if problem.responses is None else bounded_slots(scene)
         if problem.responses is not None and mechanism_rows.has_stops(bounded, problem.joints):
             back = mechanism_rows.leave_stops(
