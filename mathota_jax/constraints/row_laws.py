@@ -21,7 +21,7 @@ LARGEST_DECAY = 30.0
 """Cap on damping * J M^-1 J^T * dt, beyond which the velocity left is below round-off of either precision."""
 
 LEAST = 1e-15
-"""What resists less than this, of the inertia, is no row: it is below round-off, and its softness has infinite derivatives."""
+"""What resists less than this, of the inertia, is no row: it is below round-off, and its softness has no finite slope."""
 
 CORRECTED = (HOLD, STOP)
 """Laws whose errors the position correction removes."""
