@@ -71,6 +71,9 @@ def convex_distance(
     else:
         searched, solution, upper = search_curved(frozen, tolerance)
     closest = polish(shapes, searched, solution)
+    # Stored, as the result is: each kernel of the faces would polish again for itself.
+    normal, point_a, point_b = compute_once((closest.normal, closest.point_a, closest.point_b), shapes.position.x)
+    closest = closest._replace(normal=normal, point_a=point_a, point_b=point_b)
     gap = dot(closest.normal, closest.point_b - closest.point_a)
     point_a, point_b = closest.point_a * shapes.scale, closest.point_b * shapes.scale
     separation = gap * shapes.scale
@@ -82,11 +85,13 @@ def convex_distance(
     def to_world(vector: Vec3) -> Vec3:
         return vector if pose_a.rotation is None else pose_a.rotation.apply(vector)
 
+    point_a, point_b = pose_a.position + to_world(point_a), pose_a.position + to_world(point_b)
+    normal, separation, point_a, point_b = compute_once((to_world(normal), separation, point_a, point_b), separation)
     return ConvexContact(
-        to_world(closest.normal),
+        normal,
         separation,
-        pose_a.position + to_world(point_a),
-        pose_a.position + to_world(point_b),
+        point_a,
+        point_b,
         _feature(closest.ties),
         proved(frozen, lax.stop_gradient(closest), upper, tolerance),
     )

@@ -84,9 +84,9 @@ def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
     simplex, solution = lax.stop_gradient((simplex, solution))
     rounding = _rounding(shapes)
     ties = solution.ties
-    normal = _implicit_normal(shapes, solution.normal, ties, solution.exact)
+    normal = compute_once(_implicit_normal(shapes, solution.normal, ties, solution.exact), solution.separation)
     points = _tied_points(shapes, ties, normal)
-    weights = barycentric(_differences(points), ties.two, ties.three)
+    weights = compute_once(barycentric(_differences(points), ties.two, ties.three), solution.separation)
     lowest = lax.stop_gradient(jnp.minimum(weights[0], jnp.minimum(weights[1], weights[2])))
     point_a, point_b = (combine(weights, list(of_shape)) for of_shape in zip(*points, strict=True))
     if _curved(shapes):
@@ -94,6 +94,7 @@ def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
         lost = ~solution.exact & (solution.separation > 0)
         searched_a, searched_b = _searched_points(shapes, simplex)
         point_a, point_b = where(lost, searched_a, point_a), where(lost, searched_b, point_b)
+        point_a, point_b = compute_once((point_a, point_b), solution.separation)
         # A rim seen almost along its axis turns the round-off of the normal into a hundred times that along the rim.
         middle, half_gap = (point_a + point_b) * 0.5, normal * (0.5 * dot(normal, point_b - point_a))
         point_a, point_b = middle - half_gap, middle + half_gap
@@ -264,8 +265,9 @@ def _step(shapes: Difference, ties: Ties, normal: Vec3, points: list[Vec3]) -> V
     eps = float(jnp.finfo(normal.x.dtype).eps)
     weights = barycentric(points, ties.two, ties.three)
     middle = combine(weights, points)
-    separation = dot(normal, middle)
     curvatures = _curvatures(shapes, ties, weights, normal)
+    # Stored: each case has its own kernels, and they need all of it.
+    middle, curvatures, separation = compute_once((middle, curvatures, dot(normal, middle)), normal.x)
 
     # Three ties: the normal of their triangle.
     edge, other = points[1] - points[0], points[2] - points[0]
