@@ -41,11 +41,11 @@ def impact(approach: Approach, dt: Array) -> tuple[Array, Array]:
     separation, start = approach.separation, approach.start
     gap = jnp.maximum(separation, 0.0)
     hits = settle(jnp.where(gap + start * dt <= 0, 1.0, 0.0) + jnp.where(separation <= 0, 1.0, 0.0)) > 0
-    # Of those that hit: a gap of metres over next to no speed has an infinite derivative, times 0.
-    time = jnp.clip(safe_divide(gap, jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)), 0.0, dt)
     # The gap changes by dt (start + end) / 2, so this end velocity closes it and no more.
     target = jnp.where(hits, 0.0, -2.0 * gap / dt - start)
     stopped = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
+    # Only of those that hit: a gap of metres over next to no speed has an infinite derivative, times 0.
+    time = jnp.clip(safe_divide(gap, stopped), 0.0, dt)
     # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
     share = safe_divide(stopped, stopped + norm(approach.gravity) * dt)
     lever = 0.5 * dt + share * (0.5 * dt - time)

@@ -7,6 +7,7 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.bodies import vector
+from mathota_jax.constraints.joint_layout import joint_row_count
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import looped_slots
 from mathota_jax.model import Model
@@ -19,11 +20,8 @@ OPEN = 0.1
 
 def are_open(model: Model, joints: JointRows) -> Array | None:
     """Worlds (world,) in which a joint of a loop is open; None where there is no loop."""
-    found = _limits(model)
-    if found is None:
-        return None
-    slots, limit = found
-    return (jnp.abs(lax.stop_gradient(take(joints.error, slots))) > limit).any(0)
+    limits = _limits(model)
+    return None if limits is None else (jnp.abs(lax.stop_gradient(joints.error)) > limits).any(0)
 
 
 def correctable(model: Model, error: Array) -> Array:
@@ -32,27 +30,24 @@ def correctable(model: Model, error: Array) -> Array:
     Of joints that contradict each other large errors stay, and Newton's method on errors that stay does not converge:
     each step would throw the bodies further than the one before.
     """
-    found = _limits(model)
-    if found is None:
-        return error
-    slots, limit = found
-    bounded = jnp.clip(take(error, slots), -limit, limit)
-    if len(slots) == error.shape[0]:
-        return bounded
-    return jnp.broadcast_to(error, (error.shape[0], bounded.shape[-1])).at[slots].set(bounded)
+    limits = _limits(model)
+    return error if limits is None else jnp.clip(error, -limits, limits)
 
 
-def _limits(model: Model) -> tuple[np.ndarray, Array] | None:
-    """Slots of rows that hold joints of closed loops, in ascending order, and their errors beyond which these are open."""
+def _limits(model: Model) -> Array | None:
+    """Errors (slot, world) beyond which joints of loops are open, infinite for all others; None where there is no loop."""
     scene = model.scene
-    found = sorted(looped_slots(scene), key=lambda row: row[1])
+    found = looped_slots(scene)
     if not found:
         return None
-    place, slots, angular = (np.array(column) for column in zip(*found, strict=True))
+    joint_of_slot = np.zeros(joint_row_count(scene), int)
+    looped, angular = np.zeros((2, len(joint_of_slot), 1), bool)
+    for joint, slot, is_angle in found:
+        joint_of_slot[slot], looped[slot], angular[slot] = joint, True, is_angle
     reach = jnp.zeros(())
     for side, anchors in (("parent", model.joint_anchor_parent), ("child", model.joint_anchor_child)):
-        bodies = np.array([getattr(scene.joints[joint], side) for joint in place])
-        arm = norm(vector(lax.stop_gradient(take(anchors, place))))
+        bodies = np.array([getattr(scene.joints[joint], side) for joint in joint_of_slot])
+        arm = norm(vector(lax.stop_gradient(take(anchors, joint_of_slot))))
         moves = ~np.asarray(scene.static)[bodies]
         reach = reach + jnp.where(moves[:, None], arm + lax.stop_gradient(take(model.size, bodies)), 0.0)
-    return slots, OPEN * jnp.where(angular[:, None], 1.0, reach)
+    return jnp.where(looped, OPEN * jnp.where(angular, 1.0, reach), jnp.inf)

@@ -17,7 +17,7 @@ HALF = 0.1  # every shape reaches this far below its centre
 SHAPES = {"sphere": Sphere(HALF), "box": Box((HALF, HALF, HALF)), "capsule": Capsule(0.04, 0.06)}
 
 TINY = (1e-9, 1e-12, 1e-15, 1e-20, 1e-25, 1e-30, 1e-36)
-"""Speeds of bodies at rest but for round-off."""
+"""Speeds of bodies at rest but for round-off, and coefficients that all but vanish."""
 
 EVERYTHING = ("sphere", "sphere", "box", "box", "capsule", "capsule")
 
@@ -84,17 +84,17 @@ def check_every_gradient(kinds, restitution):
     free = slice(1, 1 + len(kinds))
     states = stack([dataclasses.replace(state, position=state.position.at[free].set(jnp.asarray(p))) for p in centres])
     # An impact must not divide by a vanishing approach speed, nor by the square of one that underflows.
-    speeds = (0.0, 0.5, *TINY)
+    motions = ((0.0, 0.0), (0.5, 0.0), *((speed, speed) for speed in TINY))
     moving = [
         dataclasses.replace(
             states,
             velocity=states.velocity.at[:, free, 1].add(-speed),
-            angular_velocity=states.angular_velocity.at[:, free, 2].add(0.0 if speed == 0.5 else -speed),
+            angular_velocity=states.angular_velocity.at[:, free, 2].add(-spin),
         )
-        for speed in speeds
+        for speed, spin in motions
     ]
     states = jax.tree.map(lambda *parts: jnp.concatenate(parts), *moving)
-    names = [f"{name}, at {speed:g} m/s" for speed in speeds for name in names]
+    names = [f"{name}, at {speed:g} m/s, {spin:g} rad/s" for speed, spin in motions for name in names]
     weights = [np.random.default_rng(3).normal(size=(model.scene.body_count, size)) for size in (3, 4, 3, 3)]
 
     def loss(model, state, action):

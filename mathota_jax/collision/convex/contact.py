@@ -72,8 +72,8 @@ def convex_distance(
         searched, solution, upper = search_curved(frozen, tolerance)
     closest = polish(shapes, searched, solution)
     # Stored, as the result is: each kernel of the faces would polish again for itself.
-    normal, point_a, point_b = compute_once((closest.normal, closest.point_a, closest.point_b), shapes.position.x)
-    closest = closest._replace(normal=normal, point_a=point_a, point_b=point_b)
+    fields = {"normal": closest.normal, "point_a": closest.point_a, "point_b": closest.point_b}
+    closest = closest._replace(**compute_once(fields, shapes.position.x))
     gap = dot(closest.normal, closest.point_b - closest.point_a)
     point_a, point_b = closest.point_a * shapes.scale, closest.point_b * shapes.scale
     separation = gap * shapes.scale
@@ -86,7 +86,9 @@ def convex_distance(
         return vector if pose_a.rotation is None else pose_a.rotation.apply(vector)
 
     point_a, point_b = pose_a.position + to_world(point_a), pose_a.position + to_world(point_b)
-    normal, separation, point_a, point_b = compute_once((to_world(normal), separation, point_a, point_b), separation)
+    normal, separation, point_a, point_b = compute_once(
+        (to_world(closest.normal), separation, point_a, point_b), separation
+    )
     return ConvexContact(
         normal,
         separation,
