@@ -40,7 +40,7 @@ from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle, store_cotangents
-from mathota_jax.spatial.vector import Vec3, dot, tangent_basis
+from mathota_jax.spatial.vector import Vec3, dot, norm, tangent_basis
 
 
 class Motion(NamedTuple):
@@ -189,7 +189,7 @@ def contact_rows(
             normal_mass=mass,
             tangent_mass=safe_divide(active, tangent_bound(entries, table.together, active)),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
-            first_grip=first_grip(table.together, active) if scene.options.solver == "pgs" else None,
+            first_grip=_first_grip(table, approach, active, model.dt) if scene.options.solver == "pgs" else None,
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
@@ -220,6 +220,12 @@ def contact_rows(
         falling,
         load=load,
     )
+
+
+def _first_grip(table: Table | TracedTable, approach: Approach, active: Array, dt: Array) -> Array | None:
+    """`first_grip` of the contacts whose points approach or part by no more than gravity does in a step."""
+    slow = jnp.where(jnp.abs(approach.start) <= norm(approach.gravity) * dt, 1.0, 0.0).astype(active.dtype)
+    return first_grip(table.together, active, pack_scalars(table, [slow], active.shape[-1])[:, 0])
 
 
 def _points(

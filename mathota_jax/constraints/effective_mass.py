@@ -70,12 +70,17 @@ def tangent_bound(entries: tuple[Entries, Entries], together: int, active: Array
     return compute_once(total / TANGENT_RELAXATION, active)
 
 
-def first_grip(together: int, active: Array) -> Array | None:
-    """`FIRST_GRIP` (turn, column, world) where it applies, else 1; None where it never does."""
+def first_grip(together: int, active: Array, slow: Array) -> Array | None:
+    """`FIRST_GRIP` (turn, column, world) where it applies, else 1; None where it never does.
+
+    `slow` is 1 for contacts that hardly approach: among others, which may hit anything at any speed, friction that
+    overshoots was measured to gain up to half of a world's energy.
+    """
     if together < 3:
         return None
     count = add_slices(active.reshape(active.shape[0], -1, together, active.shape[-1]), 2)
-    return jnp.repeat(jnp.where(count > 2.0, FIRST_GRIP, 1.0).astype(active.dtype), together, axis=1)
+    many = jnp.repeat(jnp.where(count > 2.0, 1.0, 0.0).astype(active.dtype), together, axis=1)
+    return 1.0 + (FIRST_GRIP - 1.0) * many * slow
 
 
 def _block(entries: tuple[Entries, Entries], together: int, row: int, column: int) -> Array:
