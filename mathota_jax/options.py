@@ -6,6 +6,8 @@ import dataclasses
 import math
 from typing import Any
 
+import numpy as np
+
 from mathota_jax import measured
 
 BROADPHASE_CHOICES = ("auto", "none", "all_pairs", "sort_and_sweep", "grid", "bvh")
@@ -125,7 +127,7 @@ class Options:
         ):
             value = getattr(self, name)
             optional = (name, minimum) in OPTIONAL and value is None
-            if not optional and not (isinstance(value, int) and not isinstance(value, bool) and value >= minimum):
+            if not optional and not _is_integer(value, minimum):
                 raise ValueError(f"Options.{name} must be an integer of at least {minimum}, got {value!r}")
         for name in ("linear_damping", "angular_damping", "slop"):
             value = getattr(self, name)
@@ -198,4 +200,12 @@ class Options:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return (
+        isinstance(value, int | float | np.integer | np.floating)
+        and not isinstance(value, bool)
+        and math.isfinite(value)
+    )
+
+
+def _is_integer(value: Any, minimum: int) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= minimum)

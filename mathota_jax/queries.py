@@ -7,6 +7,7 @@ are pure, differentiable, and fast under `jax.vmap` (the mapped pairs run side b
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jax.core import Tracer
 
+from mathota_jax.advancement import Mover, first_contact
 from mathota_jax.batching import batch_last
 from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.manifold import Manifold, Nearest
@@ -24,13 +26,9 @@ from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.geometry.hull import padded_faces
 from mathota_jax.geometry.leaves import Geometry
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.quaternion import Quaternion, exponential, multiply, normalize, to_matrix
+from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.settle import materialize, settle
-from mathota_jax.spatial.vector import Vec3, cross, dot, norm, where
-
-ADVANCES = 32
-"""Steps of the conservative advancement. The gap left shrinks geometrically: by the ratio of the bound on the approach
-to the approach itself, less one."""
+from mathota_jax.spatial.vector import Vec3, cross, dot, where
 
 NaturalPose = tuple[Any, Any]
 
@@ -78,7 +76,8 @@ class Impact(NamedTuple):
     Attributes:
       time: () seconds from now; 0 if they touch already, the given duration if they do not within it.
       hit: () whether they touch within the duration.
-      distance: closest points at that time.
+      distance: closest points at that time. Where its `converged` is False the search may have ended at its limit: without
+        a hit, nothing is known beyond `time`.
     """
 
     time: Array
@@ -131,9 +130,10 @@ def time_of_impact(
 ) -> Impact:
     """When two shapes that move uniformly touch first, by conservative advancement.
 
-    No step can jump over a contact: the shapes advance by the gap over a bound of their approach along the normal,
-    rotation included (B. Mirtich, "Impulse-based Dynamic Simulation", 1996, section 2.3). The derivative of the time is
-    that of the root of the gap, ``dt = -d gap / (d gap / d t)``; it is 0 where nothing is hit.
+    No step can jump over a contact of convex shapes: they advance by the time in which their velocities and rotations can
+    not close the gap (see `advancement`). Beside a heightfield, which is not convex, the motion is sampled: what grazes it
+    for less than 1/16 of the other shape's reach may be missed. The derivative of the time is that of the root of the gap,
+    ``dt = -d gap / (d gap / d t)``; it is 0 where nothing is hit.
 
     Args:
       shape_a: a shape or a `Geometry`.
@@ -145,7 +145,7 @@ def time_of_impact(
       duration: [s], at least 0.
 
     Raises:
-      ValueError: as `signed_distance`, or a motion of the wrong shape.
+      ValueError: as `signed_distance`, a motion of the wrong shape, or a negative duration.
     """
     _check_poses("time_of_impact", pose_a, pose_b)
     for name, motion in (("motion_a", motion_a), ("motion_b", motion_b)):
@@ -154,6 +154,8 @@ def time_of_impact(
                 f"time_of_impact: {name} must be (velocity, angular_velocity) of shapes (3,) and (3,), "
                 f"got {[jnp.shape(part) for part in motion]}"
             )
+    if not isinstance(duration, Tracer) and np.any(np.asarray(duration) < 0):
+        raise ValueError(f"time_of_impact: the duration must be at least 0 s, got {duration}")
     a, b = _pair("time_of_impact", shape_a, shape_b)
     return _impact(a, pose_a, motion_a, b, pose_b, motion_b, jnp.asarray(duration, jnp.result_type(float)))
 
@@ -252,13 +254,8 @@ def _sizes(geometry: Geometry) -> dict[str, Any]:
 
 def _pose(pose: NaturalPose) -> Pose:
     position, orientation = pose
-    return _placement(
-        Vec3(*(position[axis][None] for axis in range(3))), Quaternion(*(orientation[k][None] for k in range(4)))
-    )
-
-
-def _placement(position: Vec3, orientation: Quaternion) -> Pose:
-    return Pose(position, to_matrix(orientation))
+    rotation = to_matrix(Quaternion(*(orientation[k][None] for k in range(4))))
+    return Pose(Vec3(*(position[axis][None] for axis in range(3))), rotation)
 
 
 def _nearest(a: Geometry, pose_a: Pose, b: Geometry, pose_b: Pose) -> Nearest:
@@ -315,21 +312,6 @@ def _manifold(a: Geometry, b: Geometry, pose_a: NaturalPose, pose_b: NaturalPose
     )
 
 
-class _Mover(NamedTuple):
-    """A shape in uniform motion, components (1, world)."""
-
-    geometry: Geometry
-    position: Vec3
-    orientation: Quaternion
-    velocity: Vec3
-    angular_velocity: Vec3
-    reach: Any
-
-    def at(self, time: Array) -> Pose:
-        turned = normalize(multiply(exponential(self.angular_velocity * time), self.orientation))
-        return _placement(self.position + self.velocity * time, turned)
-
-
 @batch_last
 def _impact(
     a: Geometry,
@@ -342,58 +324,37 @@ def _impact(
 ) -> Impact:
     movers = _mover(a, pose_a, motion_a), _mover(b, pose_b, motion_b)
     duration = duration[None]
-    touching = 16.0 * jnp.finfo(duration.dtype).eps * jnp.minimum(*(lax.stop_gradient(m.reach) for m in movers))
-    time = _advance(*lax.stop_gradient(movers), lax.stop_gradient(duration), touching)
-    nearest = _nearest(a, movers[0].at(time), b, movers[1].at(time))
-    # The advances shrink the gap geometrically: what is left of it counts as touching if time remains.
-    gap = lax.stop_gradient(nearest.separation)
-    hit = settle(jnp.where((gap <= 2.0 * touching) | (time < duration), 1.0, 0.0)) > 0.5
+    frozen = lax.stop_gradient(movers)
+    touching = 16.0 * jnp.finfo(duration.dtype).eps * jnp.minimum(*(mover.reach for mover in frozen))
+
+    def nearest(movers: tuple[Mover, Mover], time: Array) -> Nearest:
+        return _nearest(movers[0].geometry, movers[0].at(time), movers[1].geometry, movers[1].at(time))
+
+    time, hit, searched = first_contact(
+        *frozen, functools.partial(nearest, frozen), lax.stop_gradient(duration), touching
+    )
+    found = nearest(movers, time)
     # One Newton step of the root's time: no change of the value, the exact derivative (implicit function theorem).
-    rate = lax.stop_gradient(_approach(*movers, time, nearest))
+    rate = lax.stop_gradient(_approach(*frozen, time, lax.stop_gradient(found)))
     touches = hit & (time > 0) & (rate < 0)
-    shift = jnp.where(touches, nearest.separation / jnp.where(touches, rate, 1.0), 0.0)
+    shift = jnp.where(touches, found.separation / jnp.where(touches, rate, 1.0), 0.0)
     shift = shift - lax.stop_gradient(shift)
     # A miss ends with the duration, whatever the shapes.
-    time = jnp.where(hit, time - shift, duration)
-    return Impact(time[0], hit[0], _natural(_nearest(a, movers[0].at(time), b, movers[1].at(time))))
+    time = jnp.where(hit, time - shift, jnp.where(searched, duration, time))
+    distance = _natural(nearest(movers, time))
+    return Impact(time[0], hit[0], distance._replace(converged=distance.converged & searched[0]))
 
 
-def _mover(geometry: Geometry, pose: NaturalPose, motion: NaturalPose) -> _Mover:
+def _mover(geometry: Geometry, pose: NaturalPose, motion: NaturalPose) -> Mover:
     position, velocity, angular_velocity = (
         Vec3(*(array[axis][None] for axis in range(3))) for array in (pose[0], *motion)
     )
     orientation = Quaternion(*(pose[1][k][None] for k in range(4)))
     reach = bounding_radius(geometry.kind, _sizes(geometry))
-    return _Mover(geometry, position, orientation, velocity, angular_velocity, reach)
+    return Mover(geometry, position, orientation, velocity, angular_velocity, reach)
 
 
-def _advance(a: _Mover, b: _Mover, duration: Array, touching: Array) -> Array:
-    """Time (1, world) at which the gap is `touching`, or the duration."""
-    worlds = np.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves((a[1:5], b[1:5]))), jnp.shape(duration))
-
-    def advance(_: int, time: Array) -> Array:
-        found = _nearest(a.geometry, a.at(time), b.geometry, b.at(time))
-        bound = dot(found.normal, a.velocity - b.velocity) + _spin(a, found.normal) + _spin(b, found.normal)
-        gap = found.separation - touching
-        step = jnp.where(bound > 0, gap / jnp.where(bound > 0, bound, 1.0), jnp.inf)
-        stays = settle(jnp.where(gap <= 0, 1.0, 0.0)) > 0.5
-        return jnp.where(stays, time, jnp.minimum(time + step, duration))
-
-    return lax.fori_loop(0, ADVANCES, advance, jnp.zeros(worlds, duration.dtype))
-
-
-def _spin(mover: _Mover, normal: Vec3) -> Array:
-    """Largest speed along a fixed direction that turning can give to a point of the shape, now or later.
-
-    ``n . (omega x r) = r . (n x omega)``, and omega stays. An infinite shape that turns has no bound.
-    """
-    if mover.geometry.kind == "sphere":
-        return jnp.zeros(())
-    across = norm(cross(normal, mover.angular_velocity))
-    return jnp.where(across > 0, across * mover.reach, 0.0)
-
-
-def _approach(a: _Mover, b: _Mover, time: Array, nearest: Nearest) -> Array:
+def _approach(a: Mover, b: Mover, time: Array, nearest: Nearest) -> Array:
     """Rate of change of the separation [m/s]."""
     speeds = [
         dot(nearest.normal, m.velocity + cross(m.angular_velocity, point - (m.position + m.velocity * time)))

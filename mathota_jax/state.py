@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import operator
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
+from jax.core import Tracer
 
 from mathota_jax.struct import pytree
 
@@ -110,7 +113,7 @@ def apply_force(state: State, body: int, force: Array, point: Array | None = Non
 
     Args:
       state: state of one world.
-      body: handle of the body.
+      body: handle of the body; a traced one is not checked.
       force: (3,) force [N], world frame.
       point: (3,) point of application [m], world frame; None for the centre of mass.
 
@@ -118,17 +121,33 @@ def apply_force(state: State, body: int, force: Array, point: Array | None = Non
       State with the force, and its torque about the centre of mass, added to what was applied before.
 
     Raises:
-      ValueError: `body` is out of range, or `force` or `point` is not a vector of three components.
+      ValueError: `body` is out of range, `force` or `point` is not a vector of three components, or the state is one of
+        several worlds.
     """
-    body_count = state.position.shape[-2]
-    if not 0 <= int(body) < body_count:
-        raise ValueError(f"apply_force: body must lie between 0 and {body_count - 1}, got {body}")
+    if state.position.ndim != 2:
+        raise ValueError(
+            f"apply_force: state.position must have shape (body, 3), got {state.position.shape}; use jax.vmap for several "
+            "worlds"
+        )
+    _check_handle(body, len(state.position))
     force = _vector("force", force)
     applied = dataclasses.replace(state, applied_force=state.applied_force.at[body].add(force))
     if point is None:
         return applied
     torque = jnp.cross(_vector("point", point) - state.position[body], force)
     return dataclasses.replace(applied, applied_torque=state.applied_torque.at[body].add(torque))
+
+
+def _check_handle(body: Any, count: int) -> None:
+    """A traced handle can not be checked."""
+    if isinstance(body, Tracer):
+        return
+    try:
+        fits = 0 <= operator.index(body) < count
+    except TypeError:
+        fits = False
+    if not fits:
+        raise ValueError(f"apply_force: body must lie between 0 and {count - 1}, got {body!r}")
 
 
 def _vector(name: str, value: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import numbers
 from typing import NamedTuple
 
 import jax
@@ -19,6 +20,7 @@ from mathota_jax.constraints.problem import Forces, constrain, known_impulses, s
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
+from mathota_jax.leaf_shapes import check_leaves
 from mathota_jax.model import Model
 from mathota_jax.outcome import end_forces, forces, new_state
 from mathota_jax.phases import (
@@ -57,8 +59,9 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
       identity; that of their velocities is 0.
 
     Raises:
-      ValueError: the action has the wrong shape, or a state of another scene was given.
+      ValueError: the action or a leaf has the wrong shape or type, or a state of another scene was given.
     """
+    check_leaves("step", model, state)
     scene = model.scene
     if action is None:
         action = jnp.zeros(len(scene.motors), state.position.dtype)
@@ -66,11 +69,6 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
     if action.shape != (len(scene.motors),):
         raise ValueError(
             f"step: action must have shape ({len(scene.motors)},), one entry for each motor, got {action.shape}"
-        )
-    if state.position.shape != (scene.body_count, 3):
-        raise ValueError(
-            f"step: state.position must have shape ({scene.body_count}, 3) for this model, got {state.position.shape}; "
-            "use jax.vmap for several worlds"
         )
     if (state.sleep is not None) != scene.options.sleep:
         raise ValueError(
@@ -100,10 +98,11 @@ def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, St
     Raises:
       ValueError: a negative number of steps, or actions of the wrong shape.
     """
+    check_leaves("rollout", model, state)
     motor_count = len(model.scene.motors)
-    if isinstance(actions, int):
-        if actions < 0:
-            raise ValueError(f"rollout: the number of steps must be at least 0, got {actions}")
+    if isinstance(actions, numbers.Integral):
+        if isinstance(actions, bool) or actions < 0:
+            raise ValueError(f"rollout: the number of steps must be an integer of at least 0, got {actions}")
         actions = jnp.zeros((actions, motor_count), state.position.dtype)
     actions = jnp.asarray(actions)
     if actions.ndim != 2 or actions.shape[1] != motor_count:

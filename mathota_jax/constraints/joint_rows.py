@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -30,8 +32,11 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.quaternion import exponential, multiply
-from mathota_jax.spatial.settle import compute_once, store_cotangents
+from mathota_jax.spatial.settle import compute_once, settle, store_cotangents
 from mathota_jax.spatial.vector import Vec3, cross
+
+BEYOND_STOP = 0.1
+"""Angle [rad] by which a joint with one limit can be beyond it, and not before it by a full turn less."""
 
 
 class JointRows(NamedTuple):
@@ -112,6 +117,8 @@ def _coordinate_row(feature: str, group: JointGroup, frames: JointFrames, limits
     coordinate = group.kind.coordinate
     assert coordinate is not None
     sides, value, curved = coordinate.sides(frames), coordinate.value(frames), coordinate.curved
+    if coordinate.angular and feature in ("lower", "upper", "locked"):
+        value = _turned_into(value, limits)
     if feature == "lower":
         return lower_row(sides, value, limits[:, 0], curved)
     if feature == "upper":
@@ -121,6 +128,20 @@ def _coordinate_row(feature: str, group: JointGroup, frames: JointFrames, limits
     if feature == "velocity":
         return free_row(sides, DRIVE, curved)
     return JointRow(*sides, value, {"spring": ELASTIC, "position": SERVO}[feature], curved)
+
+
+def _turned_into(angle: Array, limits: Array) -> Array:
+    """The angle with the full turn that brings it closest to the middle of its limits.
+
+    A stop at half a turn would else be passed by any round-off. Beside an open side, where an arm may come round, what is up
+    to `BEYOND_STOP` beyond the limit counts as pressed into it.
+    """
+    lower, upper = limits[:, 0], limits[:, 1]
+    turn = 2.0 * math.pi
+    least = jnp.where(lower < -turn, upper - turn + 2.0 * BEYOND_STOP, lower)
+    greatest = jnp.where(upper > turn, lower + turn - 2.0 * BEYOND_STOP, upper)
+    middle = jax.lax.stop_gradient(0.5 * (least + greatest))
+    return angle - turn * settle(jnp.round((angle - middle) / turn))
 
 
 def stack_rows(values: list[Array], counts: list[int]) -> Array:

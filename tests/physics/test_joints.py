@@ -256,3 +256,15 @@ def test_jointed_bodies_do_not_collide(float64):
     model, state = pendulum(arm=0.1)
     final = jax.block_until_ready(advance(model, state, 60))
     assert float(np.abs(np.asarray(final.velocity)).max()) < 1e-9
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("lower", [-1.0, -3.0, -np.pi])
+def test_a_stop_at_half_a_turn(precision, gate, lower, sign):
+    """The arm that turns at 4 rad/s stops at pi, where the angle jumps by a full turn, and stays there."""
+    limits = sorted((sign * lower, sign * np.pi))
+    model, state = pendulum(gravity=(0.0, 0.0, 0.0), rate=4.0 * sign, limits=limits)
+    _, recorded = record_worlds(repeat(model, 1), repeat(state, 1), 480, with_joint_angle)
+    angle = np.unwrap(np.asarray(recorded["angle"], float)[:, 0, 0])
+    gate("beyond the stop", np.maximum(sign * angle - np.pi, 0.0), 1e-3)
+    gate("away from it in the last second", sign * angle[240:] - np.pi, 1e-3)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from mathota_jax import Options
@@ -35,6 +36,11 @@ def test_defaults():
 @pytest.mark.parametrize("name", OFF)
 def test_every_extra_can_be_zero(name):
     assert getattr(Options(**{name: OFF[name]}), name) == 0
+
+
+def test_numbers_of_numpy_are_numbers():
+    options = Options(dt=np.float32(0.5), velocity_iterations=np.int64(3))
+    assert (options.dt, options.velocity_iterations) == (0.5, 3)
 
 
 def test_options_are_frozen_hashable_and_comparable():

@@ -20,22 +20,12 @@ from mathota_jax import (
     closest_points,
     manifold,
     signed_distance,
-    time_of_impact,
 )
 from mathota_jax.collision.pairs import CLOSED_FORM, PAIRS, SEPARATING_AXES
 from mathota_jax.geometry import SHAPES
+from tests.poses import UPRIGHT, at, turned
 
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 QUICK_METHODS = (CLOSED_FORM, SEPARATING_AXES)
-STILL = (np.zeros(3), np.zeros(3))
-
-
-def at(*position, orientation=UPRIGHT):
-    return np.asarray(position, float), np.asarray(orientation, float)
-
-
-def turned(axis, angle):
-    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.asarray(axis, float))])
 
 
 def example(kind):
@@ -211,74 +201,6 @@ def test_axes_of_capsules_that_all_but_meet(precision, depth):
     )
 
 
-# ---- time of impact ----------------------------------------------------------------------------------------------
-
-
-def test_two_balls_meet(precision, gate):
-    """Gap 9 less, speed 10: 0.9 s (the case of the parry library)."""
-    found = time_of_impact(
-        Sphere(0.5), at(0, 0, 0), (np.array([10.0, 0, 0]), np.ones(3)), Sphere(0.5), at(10, 0, 0), STILL, 2.0
-    )
-    limit = 1e-12 if precision == "float64" else 1e-6
-    assert found.hit
-    gate("time", found.time - 0.9, limit)
-    gate("gap", found.distance.separation, 20 * limit)
-
-
-def test_rod_swings_onto_a_plane(float64, gate):
-    """The end of a turning rod, L sin(omega t) below its centre, reaches the plane below: rotation alone closes the gap."""
-    length, radius, height, rate = 1.0, 0.05, 0.5, 2.0
-    lying = turned((0, 0, 1), np.pi / 2)  # the rod's axis along -x
-
-    def time(height, rate):
-        return time_of_impact(
-            Plane((0, 1, 0)), at(0, 0, 0), STILL,
-            Capsule(radius, length), (jnp.array([0.0, height, 0.0]), lying), (np.zeros(3), jnp.array([0, 0, rate])), 3.0,
-        ).time  # fmt: skip
-
-    truth = np.arcsin((height - radius) / length) / rate
-    value, (by_height, by_rate) = jax.value_and_grad(time, argnums=(0, 1))(height, rate)
-    gate("time", value - truth, 1e-9)
-    gate("d time / d height", by_height - 1.0 / (rate * np.sqrt(length**2 - (height - radius) ** 2)), 1e-7)
-    gate("d time / d rate", by_rate + truth / rate, 1e-7)
-
-
-def test_no_impact_within_the_duration(float64):
-    for velocity, duration in (((1.0, 0, 0), 1.0), ((-1.0, 0, 0), 5.0), ((0, 1.0, 0), 9.0)):
-        found = time_of_impact(
-            Sphere(0.5),
-            at(0, 0, 0),
-            (np.array(velocity), np.zeros(3)),
-            Box((0.5, 0.5, 0.5)),
-            at(4, 0, 0),
-            STILL,
-            duration,
-        )
-        assert not found.hit and found.time == duration
-
-
-def test_touching_from_the_start():
-    found = time_of_impact(Sphere(1.0), at(0, 0, 0), STILL, Sphere(1.0), at(1, 0, 0), STILL, 1.0)
-    assert found.hit and found.time == 0.0
-
-
-def test_a_bullet_never_passes_through_a_thin_plate(float64, gate):
-    rng = np.random.default_rng(0)
-    speeds = rng.uniform(100, 1000, 64)
-    spins = rng.normal(size=(64, 3)) * 50
-
-    def impact(speed, spin):
-        motion = (jnp.array([1.0, 0.0, 0.0]) * speed, spin)
-        return time_of_impact(
-            Box((0.01, 0.005, 0.005)), at(-5, 0, 0), motion, Box((0.001, 2, 2)), at(0, 0, 0), STILL, 1.0
-        )
-
-    found = jax.vmap(impact)(speeds, spins)
-    assert found.hit.all()
-    gate("time * speed against the reach of the bullet [m]", np.abs(found.time * speeds - 4.99), 0.01)
-    gate("gap", found.distance.separation, 1e-5)
-
-
 # ---- bad input ---------------------------------------------------------------------------------------------------
 
 
@@ -297,11 +219,6 @@ def test_a_bullet_never_passes_through_a_thin_plate(float64, gate):
 def test_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         signed_distance(*arguments)
-
-
-def test_bad_motion():
-    with pytest.raises(ValueError, match="motion_b must be"):
-        time_of_impact(Sphere(1), at(0, 0, 0), STILL, Sphere(1), at(3, 0, 0), (np.zeros(3),), 1.0)
 
 
 def test_every_shape_has_an_example():

@@ -210,3 +210,46 @@ def test_nothing_assumes_an_up_axis(float64, name, gate):
     difference = rotation_matrix(turned.orientation) - rotation @ rotation_matrix(upright.orientation)
     gate("orientation", difference[1:], 1e-6)
     assert float(np.abs(np.asarray(upright.velocity)[1:4, 1]).max()) < 3.0  # they did reach the ground and were stopped
+
+
+def replaced(owner, name, value):
+    model, state = slab_on_plane()
+    if owner == "model":
+        return dataclasses.replace(model, **{name: value}), state
+    return model, dataclasses.replace(state, **{name: value})
+
+
+@pytest.mark.parametrize(("owner", "name", "value", "message"), [
+    ("model", "mass", jnp.ones(3), r"model\.mass must have shape \(2,\) for this model, got \(3,\)"),
+    ("model", "friction", 0.5, r"model\.friction must have shape \(2,\) for this model, got \(\)"),
+    ("model", "gravity", jnp.zeros(2), r"model\.gravity must have shape \(3,\)"),
+    ("state", "orientation", jnp.ones((2, 3)), r"state\.orientation must have shape \(2, 4\)"),
+    ("state", "velocity", jnp.ones((5, 2, 3)), r"state\.velocity must have shape \(2, 3\) .* use jax\.vmap"),
+    ("state", "position", jnp.ones((2, 3), int), r"state\.position must be floating point, got int"),
+])  # fmt: skip
+def test_leaves_that_do_not_fit_are_named(owner, name, value, message):
+    for function in (step, lambda *arguments: rollout(*arguments, 2)):
+        with pytest.raises(ValueError, match=message):
+            function(*replaced(owner, name, value))
+
+
+def test_model_and_state_in_the_wrong_order():
+    model, state = slab_on_plane()
+    with pytest.raises(ValueError, match="expected a Model and a State, in this order, got State and Model"):
+        step(state, model)
+
+
+def test_forces_on_a_batch_or_on_no_body_are_refused():
+    _, state = slab_on_plane()
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), state)
+    with pytest.raises(ValueError, match=r"apply_force: state\.position must have shape .* use jax\.vmap"):
+        apply_force(batch, 1, jnp.ones(3))
+    for body in ("slab", 1.0, 2, -1):
+        with pytest.raises(ValueError, match="apply_force: body must lie between 0 and 1"):
+            apply_force(state, body, jnp.ones(3))
+
+
+def test_a_traced_handle():
+    _, state = slab_on_plane()
+    pushed = jax.vmap(lambda body: apply_force(state, body, jnp.ones(3)).applied_force)(jnp.arange(2))
+    np.testing.assert_array_equal(pushed, np.eye(2)[:, :, None] * np.ones(3))

@@ -21,7 +21,8 @@ class Hinge:
       anchor: (3,) point on the axis [m], world frame at build time.
       axis: (3,) direction of the axis, world frame at build time; need not be a unit vector.
       limits: smallest and largest angle [rad], between -pi and pi, infinite for an open side; None for no limits. Stops
-        without restitution; equal limits hold the angle.
+        without restitution; equal limits hold the angle. The angle is known but for full turns: with one side open, an
+        arm that comes round a whole turn passes the stop, with a jolt.
       damping: viscous coefficient [N m s/rad].
       friction: dry friction [N m]: the torque, at most this, that keeps the angle or resists its change.
       stiffness: of a torsion spring [N m/rad].

@@ -1,0 +1,75 @@
+"""Whether the leaves of a model and a state fit its scene: clear errors where a user has replaced some."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mathota_jax.model import Model
+from mathota_jax.scene import Scene
+from mathota_jax.state import State
+
+BODY, JOINT, MOTOR = "body", "joint", "motor"
+MODEL: dict[str, tuple] = {
+    "dt": (),
+    "gravity": (3,),
+    "mass": (BODY,),
+    "inertia": (BODY, 3),
+    "inertia_frame": (BODY, 4),
+    "size": (BODY,),
+    "friction": (BODY,),
+    "restitution": (BODY,),
+    "joint_anchor_parent": (JOINT, 3),
+    "joint_anchor_child": (JOINT, 3),
+    "joint_frame_parent": (JOINT, 4),
+    "joint_frame_child": (JOINT, 4),
+    "joint_limits": (JOINT, 2),
+    "joint_swing": (JOINT,),
+    "joint_damping": (JOINT,),
+    "joint_friction": (JOINT,),
+    "joint_stiffness": (JOINT,),
+    "joint_rest": (JOINT,),
+    "joint_armature": (JOINT,),
+    "motor_limit": (MOTOR,),
+    "motor_gear": (MOTOR,),
+    "motor_cap": (MOTOR,),
+    "motor_stiffness": (MOTOR,),
+    "motor_damping": (MOTOR,),
+}
+STATE: dict[str, tuple] = {
+    "position": (BODY, 3),
+    "orientation": (BODY, 4),
+    "velocity": (BODY, 3),
+    "angular_velocity": (BODY, 3),
+    "applied_force": (BODY, 3),
+    "applied_torque": (BODY, 3),
+}
+"""Shapes by the counts of the scene; a leaf that is None is absent."""
+
+
+def check_leaves(label: str, model: Model, state: State) -> None:
+    """Checks kinds, shapes and types; shapes of geometry and what the solver remembers are left to those who read them.
+
+    Raises:
+      ValueError: one of them does not fit, or model and state are not what they should be.
+    """
+    if not isinstance(model, Model) or not isinstance(state, State):
+        kinds = f"{type(model).__name__} and {type(state).__name__}"
+        raise ValueError(f"{label}: expected a Model and a State, in this order, got {kinds}")
+    for owner, value, shapes in (("state", state, STATE), ("model", model, MODEL)):
+        for name, shape in shapes.items():
+            _check(label, f"{owner}.{name}", getattr(value, name), shape, model.scene)
+
+
+def _check(label: str, name: str, leaf: Any, symbolic: tuple, scene: Scene) -> None:
+    if leaf is None:
+        return
+    counts = {BODY: scene.body_count, JOINT: len(scene.joints), MOTOR: len(scene.motors)}
+    shape = tuple(counts.get(length, length) for length in symbolic)
+    if np.shape(leaf) != shape:
+        hint = "; use jax.vmap for several worlds" if np.ndim(leaf) > len(shape) else ""
+        raise ValueError(f"{label}: {name} must have shape {shape} for this model, got {np.shape(leaf)}{hint}")
+    number = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
+    if number.kind in "biu":
+        raise ValueError(f"{label}: {name} must be floating point, got {number}")
