@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import rollout
+from mathota_jax import Box, Plane, SceneBuilder, rollout
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.scenes import GRAVITY, slab_on_plane, undamped
+from tests.scenes import DOWN, GRAVITY, slab_on_plane, undamped
 
 SPEED, FRICTION = 2.0, 0.4
 DT = 1 / 240
@@ -91,3 +91,25 @@ def test_forward_mode_equals_reverse_mode(float64):
     reverse = derivatives(parameters, model, state, 60)
     for a, b in zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
+
+
+def test_a_spinning_box_that_just_touches(float64, gate):
+    """`converged`: how fast a sliding box still spins, by its mass at a given inertia, against central differences."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.4)
+    builder.add_body(
+        Box((0.2, 0.1, 0.15)),
+        mass=1.0,
+        position=(0, 0.1, 0),
+        velocity=(2.0, 0, 0),
+        angular_velocity=(0, 1.0, 0),
+        friction=0.4,
+    )
+    model, state = builder.build(undamped(dt=1 / 240, solver="converged"))
+
+    def spin(mass):
+        return rollout(dataclasses.replace(model, mass=model.mass.at[1].set(mass)), state, 20)[0].angular_velocity[1, 1]
+
+    value = jax.jit(spin)
+    truth = (value(1.0 + 1e-5) - value(1.0 - 1e-5)) / 2e-5
+    gate("derivative / difference quotient - 1", jax.jit(jax.grad(spin))(1.0) / truth - 1.0, 1e-5)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
+from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
 from tests.benchmarks.hard_scenes import chain, joint_gaps, overlapping_pyramid
 from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, check
 from tests.gradients.test_bounce_gradient import run as bounce
@@ -397,3 +397,16 @@ def test_gradient_through_the_broadphase(float64, gate):
     along = jnp.sum(gradient * direction)
     gate("reverse / forward - 1", along / forward - 1, 1e-9)
     gate("reverse / difference quotient - 1", along / quotient - 1, 1e-4)
+
+
+def test_a_stop_has_no_restitution(gate):
+    """An arm that turns at 4 rad/s about its end runs into a stop, which takes all of its speed."""
+    builder = SceneBuilder(gravity=(0.0, 0.0, 0.0))
+    base = builder.add_body(Box((0.1, 0.1, 0.1)), static=True)
+    arm = builder.add_body(
+        Box((0.5, 0.05, 0.05)), mass=1.0, position=(0.5, 0, 0), velocity=(0, 2, 0), angular_velocity=(0, 0, 4)
+    )
+    builder.add_joint(Hinge(base, arm, (0, 0, 0), (0, 0, 1), limits=(-1.0, 1.0)))
+    model, state = builder.build(soft_undamped(dt=1 / 240))
+    _, trajectory = jax.jit(lambda m, s: rollout(m, s, 120))(model, state)
+    gate("rebound / speed of impact", np.maximum(-np.asarray(trajectory.angular_velocity[:, 1, 2]), 0.0) / 4.0, 0.01)
