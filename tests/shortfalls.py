@@ -31,9 +31,6 @@ SHORTFALLS: dict[str, str] = {
     "(energy never gained), one rod alone holds with 10",
     "tests/physics/test_mechanism_steps.py::test_a_fast_chain_does_not_pass_a_wall[180.0]": "four jointed balls of 0.1 m "
     "that fly at 180 m/s against a wall: the centre of one gets 7.4 mm into it, gate 0; none passes, none does at 30 m/s",
-    "tests/physics/test_soft_step.py::test_a_stop_has_no_restitution": "an arm rebounds at 0.63 of its speed: the stop ends "
-    "its turn, the anchor its motion, and the two sweeps of a substep leave of both what turns it back; 0.31 with 16 "
-    "substeps, none with the other solvers or for a slider, no energy is gained",
     "tests/gradients/test_slide_gradient.py::test_a_spinning_box_that_just_touches": "the derivative by the mass is 7 % too "
     "large, that by the height and the position without bound: of four corners at the height 0 to round-off some carry "
     "none of the load, and their shares are undetermined; right for one step, and where the box is pressed in by 5 um",

@@ -33,8 +33,8 @@ from mathota_jax.struct import pytree, static
 
 
 def applies(scene: Scene) -> bool:
-    """Whether rows are decoupled: mechanisms are solved exactly, and the other solvers do not sweep row by row."""
-    return scene.options.solver == "pgs" and layout(scene) is None
+    """Whether rows are decoupled: mechanisms are solved exactly, and the converged solver does not sweep row by row."""
+    return scene.options.solver != "converged" and layout(scene) is None
 
 
 @pytree

@@ -53,13 +53,19 @@ class JointMotion(NamedTuple):
 
 def velocity_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
     """Rows of one table for the velocity solver."""
-    return decoupled_rows(scene, table, model, motion, False)[0]
+    return _rows(scene, table, model, motion, False)[0]
 
 
-def decoupled_rows(
-    scene: Scene, table: Table, model: Model, motion: JointMotion, decouples: bool = True
+def decoupled_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> tuple[Rows, Decoupling]:
+    """The same with rows that are independent within each joint; also how they were made so."""
+    rows, decoupling = _rows(scene, table, model, motion, True)
+    assert decoupling is not None
+    return rows, decoupling
+
+
+def _rows(
+    scene: Scene, table: Table, model: Model, motion: JointMotion, decouples: bool
 ) -> tuple[Rows, Decoupling | None]:
-    """The same, if wished with rows that are independent within each joint; also how they were made so."""
     jacobians, responses, mass = _sides(scene, table, motion.middle, motion.inertia)
     decoupling = None
     if decouples:

@@ -45,7 +45,7 @@ class Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
 
     `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of
-    all groups, for the small steps alone; `decouplings` are those of the joint rows, None where they are as they were.
+    all groups, for the small steps alone; `decouplings` are those of the joint rows, none where these are as they were.
     """
 
     joints: joint_rows.JointRows | None
@@ -56,12 +56,12 @@ class Problem(NamedTuple):
     contact_rows: list[contact.ContactRows]
     close: compact.ClosePairs | None
     errors: tuple[PositionError, ...] = ()
-    decouplings: tuple[Decoupling | None, ...] | None = None
+    decouplings: tuple[Decoupling, ...] = ()
 
     @property
     def of_joint_rows(self) -> tuple[Decoupling | None, ...]:
         """Of each group of joint rows, how they were decoupled."""
-        return (None,) * len(self.joint_rows) if self.decouplings is None else self.decouplings
+        return self.decouplings or (None,) * len(self.joint_rows)
 
     @property
     def rows(self) -> tuple[Rows, ...]:
@@ -92,7 +92,8 @@ def constrain(
     """
     scene = model.scene
     small_steps = mechanism_layout.takes_small_steps(scene)
-    joints, held, responses, tables, errors, decouplings = None, None, None, (), (), None
+    joints, held, responses, tables, errors = None, None, None, (), ()
+    decouplings: tuple[Decoupling, ...] = ()
     if joint_layout.joint_row_count(scene):
         joints = joint_rows.joint_rows(model, bodies)
         there = joint_rows.moved_by(bodies, 0.5 * model.dt)
@@ -103,19 +104,22 @@ def constrain(
             held = mechanism.links(scene, middle, moving(scene, there).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
-        rows_of = substep_rows.joint_rows if small_steps else joint.velocity_rows
         order = joint_layout.joint_tables(scene)
         if decoupling.applies(scene):
-            found = [joint.decoupled_rows(scene, table, model, joint_motion) for table in order]
+            rows_of = substep_rows.joint_rows if small_steps else joint.decoupled_rows
+            found = [rows_of(scene, table, model, joint_motion) for table in order]
             tables, decouplings = tuple(rows for rows, _ in found), tuple(how for _, how in found)
         else:
-            tables = tuple(rows_of(scene, table, model, joint_motion) for table in order)
+            tables = tuple(joint.velocity_rows(scene, table, model, joint_motion) for table in order)
         if held is not None and (bounded := mechanism_layout.bounded_slots(scene)):
             responses = mechanism_rows.responses(held, tables, bounded)
             joint_motion = joint_motion._replace(responses=responses)
-            tables = tuple(rows_of(scene, table, model, joint_motion) for table in order)
+            tables = tuple(joint.velocity_rows(scene, table, model, joint_motion) for table in order)
         if small_steps:
-            errors = tuple(substep_rows.joint_error(scene, rows, model, joint_motion) for rows in tables)
+            errors = tuple(
+                substep_rows.joint_error(scene, rows, model, joint_motion, how)
+                for rows, how in zip(tables, decouplings, strict=True)
+            )
     contacts, contact_rows, close = None, [], None
     if scene.slot_count:
         found = own_contacts(model, bodies)

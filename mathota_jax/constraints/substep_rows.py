@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from jax import Array
 from mathota_jax.constraints import joint
 from mathota_jax.constraints.assembly import pack_scalars, smaller_side
 from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.joint import JointMotion
 from mathota_jax.constraints.joints.rows import HOLD, STOP
 from mathota_jax.model import Model
@@ -26,14 +28,20 @@ PUSH_OUT_RATE = 6.0
 turn, in radians."""
 
 
-def joint_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> Rows:
-    """Rows of one table whose laws are those of one substep; the turning of the Jacobian is left to `joint_error`."""
-    still = motion._replace(middle=motion.middle._replace(rate=motion.start.rate))
+def joint_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> tuple[Rows, Decoupling]:
+    """Rows of one table whose laws are those of one substep, and how they were decoupled.
+
+    The turning of the Jacobian and the errors of the rows that hold are left to `joint_error`.
+    """
+    error = jnp.where((motion.start.laws == HOLD)[:, None], 0.0, motion.start.error)
+    still = motion._replace(
+        start=motion.start._replace(error=error), middle=motion.middle._replace(rate=motion.start.rate)
+    )
     part = dataclasses.replace(model, dt=model.dt / scene.options.substep_count)
-    return joint.velocity_rows(scene, table, part, still)
+    return joint.decoupled_rows(scene, table, part, still)
 
 
-def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion) -> PositionError:
+def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, decoupling: Decoupling) -> PositionError:
     """Errors of the rows of `joint_rows`."""
     table, worlds = rows.table, rows.bias.shape[-1]
     slots = np.maximum(table.order, 0)
@@ -41,15 +49,18 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion) -> 
     shape = (table.turn_count, 1, table.column_count, 1)
 
     def packed(values: Array) -> Array:
-        return pack_scalars(table, [take(values, slots)], worlds)
+        return pack_scalars(table, [decoupling.rows(values)], worlds)
 
     curvature = None
     if curved.any():
-        curvature = jnp.where(curved.reshape(shape), packed(motion.middle.rate - motion.start.rate), 0.0)
-    moves = (rows.jacobian[0][:, :, :3] != 0).any(2)
-    limit = PUSH_OUT_RATE * jnp.where(moves, pack_scalars(table, [_smallest_radius(scene, rows, model)], worlds), 1.0)
+        turning = take(motion.middle.rate - motion.start.rate, slots)
+        curvature = packed(jnp.where(curved[:, None], turning, 0.0))
+    linear = jax.tree.leaves((motion.start.parent.linear, motion.start.child.linear))
+    moves = functools.reduce(jnp.logical_or, [take(part, slots) != 0 for part in linear])
+    radius = pack_scalars(table, [_smallest_radius(scene, rows, model)], worlds)
+    limit = PUSH_OUT_RATE * jnp.where(pack_scalars(table, [moves.astype(radius.dtype)], worlds) > 0, radius, 1.0)
     return PositionError(
-        start=packed(motion.start.error),
+        start=packed(take(motion.start.error, slots)),
         limit=limit,
         one_sided=jnp.asarray(laws == STOP).reshape(shape) if (laws == STOP).any() else None,
         curvature=curvature,
@@ -65,7 +76,7 @@ def _force_laws(scene: Scene, rows: Rows, model: Model, motion: JointMotion, law
 
     def bias(error: Array, rate: Array) -> Array:
         at = motion._replace(start=motion.start._replace(error=error, rate=rate))
-        return joint_rows(scene, rows.table, model, at).bias
+        return joint_rows(scene, rows.table, model, at)[0].bias
 
     error, rate = motion.start.error, motion.start.rate
     by_error = jax.jvp(lambda error: bias(error, rate), (error,), (jnp.ones_like(error),))[1]
