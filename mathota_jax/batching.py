@@ -207,6 +207,8 @@ def _evaluate(*args: Array, native: Native, world_axes: int, on_cpu: bool = Fals
     """Calls `native` on arrays with any number of trailing world axes, merging them into one."""
     worlds = _worlds(args, world_axes)
     merged = [_merge_worlds(arg, worlds) for arg in args]
+    if 0 in worlds:
+        return [jnp.zeros((*shape, *worlds), dtype) for shape, dtype in _natural_results(native, merged)]
     run = functools.partial(_run, native)
     parts = on_cpu and _parts_pay(native, merged)
     outputs = by_parts(run, merged, _part_size(native, merged)) if parts else run(merged)

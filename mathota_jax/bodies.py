@@ -171,8 +171,12 @@ def place(scene: Scene, old: Array, components: Sequence[Array]) -> Array:
 
 
 def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inertia:
-    """Mass properties of the moving bodies at the given orientations."""
-    mass, moments = take((model.mass, vector(model.inertia)), scene.dynamic_bodies)
+    """Mass properties of the moving bodies at the given orientations.
+
+    Masses and moments that are not positive, where a fit may end, become NaN, so that the flags tell of them.
+    """
+    given = take((model.mass, vector(model.inertia)), scene.dynamic_bodies)
+    mass, moments = jax.tree.map(lambda value: jnp.where(value > 0, value, jnp.nan), given)
     if all(scene.spherical[body] for body in scene.dynamic_bodies):
         return Inertia(1.0 / mass, moments, None)
     frame = None if model.inertia_frame is None else take(quaternion(model.inertia_frame), scene.dynamic_bodies)

@@ -29,7 +29,12 @@ def describe(model: Model) -> str:
 
     Returns:
       Several lines of text, ``name: value`` each.
+
+    Raises:
+      ValueError: `model` is not a model.
     """
+    if not isinstance(model, Model):
+        raise ValueError(f"describe: expected a Model, got {type(model).__name__}")
     scene = model.scene
     sections = [_bodies(scene), _pairs(scene), _rows(scene), _joints(scene), _features(scene)]
     sections += [[f"memory of a state: {_state_bytes(model)} bytes a world"], _cost(scene), _settings(model)]

@@ -85,7 +85,8 @@ class Options:
         step without impact costs a look at its contacts more, one with k impacts k + 1 steps and k searches; a batch takes
         as many parts as the world with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
       sleep: let islands of bodies at rest sleep until something disturbs them; off: absent. Guide 3.4 and 12.2. A body
-        asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing.
+        asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing. Changed
+        leaves of the model, such as gravity, wake no one: see `wake`.
       sleep_velocity: speed below which a body may be at rest [m/s]. Guide 11.3. It belongs to things about a metre long
         under the gravity of the Earth: in other scenes it should grow with the square root of length times gravity.
       sleep_angular_velocity: angular speed below which a body may be at rest [rad/s]; grows with the square root of

@@ -124,12 +124,7 @@ def apply_force(state: State, body: int, force: Array, point: Array | None = Non
       ValueError: `body` is out of range, `force` or `point` is not a vector of three components, or the state is one of
         several worlds.
     """
-    if state.position.ndim != 2:
-        raise ValueError(
-            f"apply_force: state.position must have shape (body, 3), got {state.position.shape}; use jax.vmap for several "
-            "worlds"
-        )
-    _check_handle(body, len(state.position))
+    check_handle("apply_force", state, body)
     force = _vector("force", force)
     applied = dataclasses.replace(state, applied_force=state.applied_force.at[body].add(force))
     if point is None:
@@ -138,16 +133,25 @@ def apply_force(state: State, body: int, force: Array, point: Array | None = Non
     return dataclasses.replace(applied, applied_torque=state.applied_torque.at[body].add(torque))
 
 
-def _check_handle(body: Any, count: int) -> None:
-    """A traced handle can not be checked."""
+def check_handle(label: str, state: State, body: Any) -> None:
+    """Checks that the state is that of one world and has this body; a traced handle can not be checked.
+
+    Raises:
+      ValueError: it is that of several, or has not.
+    """
+    if state.position.ndim != 2:
+        raise ValueError(
+            f"{label}: state.position must have shape (body, 3), got {state.position.shape}; use jax.vmap for several worlds"
+        )
     if isinstance(body, Tracer):
         return
+    count = len(state.position)
     try:
         fits = 0 <= operator.index(body) < count
     except TypeError:
         fits = False
     if not fits:
-        raise ValueError(f"apply_force: body must lie between 0 and {count - 1}, got {body!r}")
+        raise ValueError(f"{label}: body must lie between 0 and {count - 1}, got {body!r}")
 
 
 def _vector(name: str, value: Array) -> Array:

@@ -56,13 +56,16 @@ def raycast(
       surface met changes; finite everywhere, with zero derivatives of the distance to those where nothing is met.
 
     Raises:
-      ValueError: `origin` or `direction` is not a vector of three components, or the state is that of another scene.
+      ValueError: `origin` or `direction` is not a vector of three components, `max_distance` is not one number, or the
+        state is that of another scene.
     """
     dtype = state.position.dtype
     origin, direction, max_distance = (jnp.asarray(value, dtype) for value in (origin, direction, max_distance))
     for name, value in (("origin", origin), ("direction", direction)):
         if value.shape != (3,):
             raise ValueError(f"raycast: {name} must have shape (3,), got {value.shape}; use jax.vmap for several rays")
+    if max_distance.shape:
+        raise ValueError(f"raycast: max_distance must be one number, got shape {max_distance.shape}; use jax.vmap")
     if state.position.shape != (model.scene.body_count, 3):
         raise ValueError(
             f"raycast: state.position must have shape ({model.scene.body_count}, 3) for this model, "

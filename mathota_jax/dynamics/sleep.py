@@ -19,7 +19,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import gather
 from mathota_jax.spatial.settle import settle
-from mathota_jax.state import Sleep, State
+from mathota_jax.state import Sleep, State, check_handle
 
 STEADY = 0.25
 """A body is at rest only if its acceleration would change its velocity by less than this share of the threshold within
@@ -39,16 +39,17 @@ def is_asleep(model: Model, state: State) -> Array:
 def wake(state: State, body: int) -> State:
     """Wakes a body; its whole island wakes in the next step. No effect if `Options.sleep` is off.
 
+    What is changed in the state (a pose, a velocity, a force, an action) wakes by itself. A model with other leaves (gravity
+    tilted, a mass changed) does not: wake the bodies concerned.
+
     Args:
       state: state of one world.
-      body: handle of the body.
+      body: handle of the body; a traced one is not checked.
 
     Raises:
-      ValueError: `body` is out of range.
+      ValueError: `body` is out of range, or the state is one of several worlds.
     """
-    body_count = state.position.shape[-2]
-    if not 0 <= int(body) < body_count:
-        raise ValueError(f"wake: body must lie between 0 and {body_count - 1}, got {body}")
+    check_handle("wake", state, body)
     if state.sleep is None:
         return state
     awake = dataclasses.replace(

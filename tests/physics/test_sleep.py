@@ -169,6 +169,16 @@ def test_the_user_wakes(edit):
     assert not sleeps[1] and not sleeps[2]
 
 
+def test_a_traced_handle_wakes_and_a_batch_is_refused():
+    _, state = asleep()
+    woken = jax.vmap(lambda body: wake(state, body).sleep.asleep)(jnp.array([1, 2]))
+    np.testing.assert_array_equal(woken, np.asarray(state.sleep.asleep) & ~np.eye(6, dtype=bool)[[1, 2]])
+    with pytest.raises(ValueError, match=r"wake: state\.position must have shape .* use jax\.vmap"):
+        wake(repeat(state, 2), 1)
+    with pytest.raises(ValueError, match="wake: body must lie between 0 and 5, got 6"):
+        wake(state, 6)
+
+
 @pytest.mark.parametrize("broadphase", ["none", "all_pairs"])
 def test_what_loses_its_support_falls(broadphase):
     """The lower box is taken away, far from everything: what it touched before counts."""

@@ -246,6 +246,21 @@ def test_batch_of_one_and_bitwise_repeatability(precision):
         np.testing.assert_array_equal(a, b)
 
 
+def test_no_worlds_at_all():
+    """An empty batch, as a mask that selects nothing leaves it."""
+    model, state = scene()
+    none = jax.tree.map(lambda leaf: leaf[None][:0], state)
+    advance = jax.vmap(step, in_axes=(None, 0, 0))
+    final = advance(model, none, jnp.zeros((0, 1)))
+    assert jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), final) == jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), none
+    )
+    mass = jax.grad(lambda mass: advance(dataclasses.replace(model, mass=mass), none, jnp.zeros((0, 1))).position.sum())
+    np.testing.assert_array_equal(mass(model.mass), jnp.zeros(3))
+    grid = jax.tree.map(lambda leaf: jnp.zeros((3, 0, *leaf.shape), leaf.dtype), state)
+    assert jax.vmap(advance, in_axes=(None, 0, None))(model, grid, jnp.zeros((0, 1))).position.shape == (3, 0, 3, 3)
+
+
 def test_an_output_that_all_worlds_share_has_no_derivative():
     """The normal of a plane depends on nothing that a ball does."""
     builder = SceneBuilder()

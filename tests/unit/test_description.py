@@ -55,6 +55,12 @@ def test_what_a_scene_lacks():
     assert found["contact slots"] == "0" and found["turns of a sweep"] == "0" and found["joints"] == "none"
 
 
+def test_what_is_no_model():
+    _, state = workshop()
+    with pytest.raises(ValueError, match="describe: expected a Model, got State"):
+        describe(state)
+
+
 def test_the_broadphase_and_its_capacities():
     model, _ = workshop(Options(broadphase="all_pairs", pair_capacity=7), spheres=4)
     found = lines(model)

@@ -48,9 +48,11 @@ def test_infinity_is_flagged_too():
     np.testing.assert_array_equal(flags != 0, np.arange(WORLDS) == BAD)
 
 
-def test_bad_parameter_of_one_world_is_flagged():
+@pytest.mark.parametrize("value", [jnp.nan, 0.0, -1.0])
+@pytest.mark.parametrize("name", ["mass", "inertia"])
+def test_bad_parameter_of_one_world_is_flagged(name, value):
     models, states = batch(SCENES["sphere"])
-    models = dataclasses.replace(models, mass=models.mass.at[BAD, -1].set(jnp.nan))
+    models = dataclasses.replace(models, **{name: getattr(models, name).at[BAD, -1].set(value)})
     final = advance_worlds(models, states, 40)
     np.testing.assert_array_equal(np.asarray(final.flags) != 0, np.arange(WORLDS) == BAD)
 

@@ -296,6 +296,11 @@ def test_bad_rays_are_named(name, bad):
         raycast(model, state, **arguments)
 
 
+def test_a_reach_for_each_of_no_rays():
+    with pytest.raises(ValueError, match=r"raycast: max_distance must be one number, got shape \(2,\); use jax\.vmap"):
+        raycast(*scene(Sphere(1.0)), jnp.zeros(3), jnp.array([1.0, 0, 0]), jnp.ones(2))
+
+
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
