@@ -28,7 +28,7 @@ from mathota_jax.constraints.assembly import (
     smaller_side,
     turn_of_points,
 )
-from mathota_jax.constraints.effective_mass import first_grip, normal_bound, tangent_bound
+from mathota_jax.constraints.effective_mass import first_grip, normal_bound, step_length, tangent_bound
 from mathota_jax.constraints.impact import Approach, impact, loaded, rebound
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -179,9 +179,8 @@ def contact_rows(
     else:
         target, lever = impact(approach, model.dt)
     active = compute_once(pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0], normal.x)
-    # The length of a step does not move the fixed point: its derivative is not worth computing. Empty columns of a table
-    # have no response.
-    entries = jax.lax.stop_gradient(matrix).entries()
+    # Empty columns of a table have no response.
+    entries = step_length(scene, matrix).entries()
     mass = safe_divide(active, normal_bound(entries, table.together, active))
     bias = [-target]
     if scene.friction:

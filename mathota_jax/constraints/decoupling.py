@@ -21,6 +21,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.constraints.assembly import Side
+from mathota_jax.constraints.effective_mass import step_length
 from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.mechanism_layout import held_slots, layout
 from mathota_jax.scene import Scene
@@ -28,7 +29,7 @@ from mathota_jax.solver.table import EMPTY, Table
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_slices
+from mathota_jax.spatial.spread import add_slices, for_each, spread
 from mathota_jax.struct import pytree, static
 
 
@@ -56,14 +57,15 @@ class Decoupling:
     def rows(self, values: Array) -> Array:
         """New values (turn * column, world) of quantities that are linear in the rows."""
         by_joint = self.layout.by_joint(values)
-        return self.layout.by_place(add_slices(self.matrix * by_joint[None], 1))
+        return self.layout.by_place(add_slices(self.matrix * for_each(len(by_joint), by_joint), 1))
 
     def sides(self, sides: Sequence[Side]) -> list[Side]:
         """New Jacobians or responses, components (turn * column, world)."""
         leaves, structure = jax.tree.flatten(list(sides))
         old = self.layout.stacked(leaves)
         # All components in one kernel.
-        new = add_slices(self.matrix * old[:, None], 2)
+        shape = (len(old), *self.matrix.shape)
+        new = add_slices(spread(self.matrix[None], shape) * spread(old[:, None], shape), 2)
         return jax.tree.unflatten(
             structure, [self.layout.by_place(part) for part in unstack(compute_once(new, new), 0)]
         )
@@ -159,7 +161,7 @@ def row_layout(scene: Scene, table: Table) -> RowLayout:
 
 
 def decouple(scene: Scene, table: Table, jacobians: Sequence[Side], responses: Sequence[Side]) -> Decoupling:
-    """How the rows of a table become independent. Without derivatives: which combinations are solved moves no solution.
+    """How the rows of a table become independent.
 
     Args:
       scene: static scene.
@@ -170,9 +172,10 @@ def decouple(scene: Scene, table: Table, jacobians: Sequence[Side], responses: S
     count, holding = found.shape[0], found.holding
     index = np.arange(count)[:, None]
     jacobian, response = (
-        jax.lax.stop_gradient(found.stacked(jax.tree.leaves(list(sides)))) for sides in (jacobians, responses)
+        step_length(scene, found.stacked(jax.tree.leaves(list(sides)))) for sides in (jacobians, responses)
     )
-    products = add_slices(jacobian[:, :, None] * response[:, None], 0)
+    pairs = (len(jacobian), count, *jacobian.shape[1:])
+    products = add_slices(spread(jacobian[:, :, None], pairs) * spread(response[:, None], pairs), 0)
     identity = jnp.broadcast_to(jnp.eye(count, dtype=products.dtype)[:, :, None, None], products.shape)
     # What is done to the products is done to the rows beside them.
     both = compute_once(jnp.concatenate([products, identity], axis=1), products)
@@ -180,9 +183,9 @@ def decouple(scene: Scene, table: Table, jacobians: Sequence[Side], responses: S
     for row in found.pivots:
         own = jnp.where(holding[row][:, None], both[row, row], 1.0)
         taken = holding[row] & (index != row) & ((index > row) | ~holding)
-        share = safe_divide(both[:, row], jnp.broadcast_to(own, both[:, row].shape))
+        share = safe_divide(both[:, row], for_each(count, own))
         share = compute_once(jnp.where(taken[:, :, None], share, 0.0), own)
-        both = compute_once(both - share[:, None] * both[row], own)
+        both = compute_once(both - spread(share[:, None], both.shape) * for_each(count, both[row]), own)
         shares.append(share)
     mass = found.by_place(jnp.stack([both[row, row] for row in range(count)]))
     return Decoupling(both[:, count:], tuple(shares), mass, found)

@@ -1,13 +1,15 @@
-"""Effective masses of contact points that are solved together."""
+"""Effective masses: those of contact points that are solved together, and what derivatives make of any."""
 
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
+from mathota_jax.scene import Scene
 from mathota_jax.solver.coupling import point_responses
 from mathota_jax.solver.row_matrix import Entries
 from mathota_jax.spatial.safe import safe_sqrt
@@ -27,6 +29,19 @@ are bounded for the points turning against one another, and take a third of a co
 stuck in its first step, with 1.3 it slips (and a box thrown on a slope begins to slide as on a heightfield of that slope to
 1.5 um; 1.35 leaves 10). All contacts may not have it: friction that overshoots while its limit changes was measured to keep
 bodies creeping by mm/s. One or two points have a bound that is exact, and would swing."""
+
+
+def step_length(scene: Scene, found: Any) -> Any:
+    """What only decides how far a row steps, with the derivatives that it deserves.
+
+    None where sweeps go on until it moves nothing. A small step consists of two sweeps, whose rows are as soft as they are
+    light: of it, the lengths of their steps are a part.
+
+    Args:
+      scene: static scene.
+      found: pytree of arrays.
+    """
+    return found if scene.options.solver == "soft_step" else lax.stop_gradient(found)
 
 
 def normal_bound(entries: tuple[Entries, Entries], together: int, active: Array) -> Array:

@@ -13,6 +13,7 @@ from jax import Array
 from mathota_jax.bodies import Inertia
 from mathota_jax.constraints.assembly import Side, inner, pack_scalars, pack_sides, respond, select, select_blocks
 from mathota_jax.constraints.decoupling import Decoupling, decouple
+from mathota_jax.constraints.effective_mass import step_length
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
@@ -94,8 +95,8 @@ def _rows(
     works = of_each("works")
     softness = jnp.where(works, of_each("softness"), 0.0)
     law = Bounded(
-        effective_mass=jax.lax.stop_gradient(
-            pack_scalars(table, [jnp.where(works, 1.0 / (mass + softness), 0.0)], worlds)
+        effective_mass=step_length(
+            scene, pack_scalars(table, [jnp.where(works, 1.0 / (mass + softness), 0.0)], worlds)
         ),
         softness=pack_scalars(table, [softness], worlds),
         lower=_pack_bound(table, of_each("lower"), worlds),

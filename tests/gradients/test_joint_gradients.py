@@ -30,13 +30,13 @@ SERVO_STIFFNESS, SERVO_DAMPING, GEAR, ACTION = 5.0, 0.3, 0.5, 0.7
 DURATION = DT * STEPS
 
 
-def angle(stiffness, damping, rest, arm):
+def angle(stiffness, damping, rest, arm, central=CENTRAL, duration=DURATION):
     """Of a sprung pendulum in space at the end, from rest at 0."""
-    inertia = CENTRAL + MASS * arm**2
+    inertia = central + MASS * arm**2
     half = damping / (2 * inertia)
     omega = np.sqrt(stiffness / inertia - half**2)
-    phase = omega * DURATION
-    return rest * (1 - np.exp(-half * DURATION) * (np.cos(phase) + half / omega * np.sin(phase)))
+    phase = omega * duration
+    return rest * (1 - np.exp(-half * duration) * (np.cos(phase) + half / omega * np.sin(phase)))
 
 
 def derivatives(function, arguments):
