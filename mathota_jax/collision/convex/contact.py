@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.collision.convex.difference import CODES, Difference, difference
-from mathota_jax.collision.convex.polish import Closest, polish, solve
+from mathota_jax.collision.convex.polish import Closest, polish
 from mathota_jax.collision.convex.polytope import are_polytopes, polytope
+from mathota_jax.collision.convex.polytope_solution import solve_polytopes
 from mathota_jax.collision.convex.search import search_curved, search_polytopes
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.convex.ties import Ties
@@ -67,7 +68,7 @@ def convex_distance(
     if are_polytopes((kind_a, kind_b)):
         core_a, core_b = polytope(kind_a, frozen.a | _topology(a)), polytope(kind_b, frozen.b | _topology(b))
         searched, upper = search_polytopes(frozen, core_a, core_b, tolerance)
-        solution = solve(frozen, searched, jnp.ones(upper.shape, bool))
+        solution = solve_polytopes(frozen, searched)
     else:
         searched, solution, upper = search_curved(frozen, tolerance)
     closest = polish(shapes, searched, solution)
@@ -95,23 +96,21 @@ def convex_distance(
         point_a,
         point_b,
         _feature(closest.ties),
-        proved(frozen, lax.stop_gradient(closest), upper, tolerance),
+        _proved(lax.stop_gradient(closest), upper, tolerance),
     )
 
 
-def proved(shapes: Difference, closest: Closest, upper: Array, tolerance: float) -> Array:
+def _proved(closest: Closest, upper: Array, tolerance: float) -> Array:
     """Whether the separation along the normal, a lower bound, reaches an upper one.
 
     Args:
-        shapes: The shapes, not differentiated.
         closest: The closest points, not differentiated; points outside of their shapes prove nothing.
         upper: Upper bound of the separation [size] from the search.
         tolerance: The two count as equal to this share of the size.
     """
-    lower = dot(closest.normal, shapes.least(closest.normal)[0])
     between = norm(closest.point_b - closest.point_a)
     upper = jnp.minimum(upper, jnp.where(closest.inside, between, jnp.inf))
-    return closest.consistent & (lower >= upper - tolerance)
+    return closest.consistent & (closest.reach >= upper - tolerance)
 
 
 def _topology(shape: dict[str, Any]) -> dict[str, Any]:

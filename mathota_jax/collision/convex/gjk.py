@@ -9,8 +9,10 @@ Nothing here is differentiated: the result is a discrete one, the piece pairs of
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -25,6 +27,10 @@ FLAT_ROUNDING = 8.0
 """Three points whose angle is below this many round-offs span no triangle: their normal is noise."""
 VERTEX, EDGE, TRIANGLE, INSIDE, KEEP = 0, 1, 4, 7, 8
 """Choices: the newest point alone; with slot 0, 1, 2; with slots (0, 1), (0, 2), (1, 2); all four; the old simplex."""
+NEW = 3
+"""In place of the number of a slot: the newest point."""
+OVERLAPPED = -4.0
+"""Less than any separation, in units of the size."""
 TRIANGLE_SLOTS = ((0, 1), (0, 2), (1, 2))
 
 
@@ -34,30 +40,42 @@ class Simplex(NamedTuple):
     Attributes:
         direction: Unit vector from A towards B, shape ``(pair, world)`` a component.
         pieces: Three int32 piece pairs; unused slots repeat the first.
+        points: Points of B - A of the piece pairs; None for shapes with rims, where they depend on the direction.
         point_a: The closest point of A, in the frame of A; None for polytopes, whose pieces say where it is.
         point_b: The closest point of B (before the shift), in the frame of A; None for polytopes.
         distance: Length of the vector between the closest points (after the shift).
         overlap: bool, the shapes touch or overlap.
+        extreme: Point of B - A that is extreme along the direction; any where they overlap.
+        extreme_pieces: int32, its piece pair.
+        reach: True separation along the direction, a lower bound; `OVERLAPPED` where they overlap.
     """
 
     direction: Vec3
     pieces: tuple[Array, ...]
+    points: tuple[Vec3, ...] | None
     point_a: Vec3 | None
     point_b: Vec3 | None
     distance: Array
     overlap: Array
+    extreme: Vec3
+    extreme_pieces: Array
+    reach: Array
 
 
 class _State(NamedTuple):
+    """The slots of the simplex side by side, ``(slot, pair, world)``: a third of the kernels."""
+
     turn: Array
     closest: Vec3
     squared: Array
-    points: tuple[Vec3, ...]
-    points_a: tuple[Vec3, ...] | None
-    pieces: tuple[Array, ...]
+    points: Vec3
+    points_a: Vec3 | None
+    pieces: Array
     count: Array
     overlap: Array
     done: Array
+    extreme: Vec3
+    extreme_pieces: Array
 
 
 def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations: int) -> Simplex:
@@ -68,7 +86,8 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
         start: First search direction, any length.
         shift: Displacement of B in the frame of A.
         wanted: bool, False where the result is not needed: those lanes stop at once.
-        iterations: Most iterations. All lanes stop as soon as they have converged.
+        iterations: Most iterations. All lanes stop as soon as they have converged. One more sees how far the shapes reach
+            along the last direction.
     """
     tracked = not are_polytopes((shapes.kind_a, shapes.kind_b))
     eps = float(jnp.finfo(start.x.dtype).eps)
@@ -83,10 +102,15 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
         # Lanes whose new point does not come closer along the direction have converged.
         gain = state.squared - dot(state.closest, point)
         reached = (state.count > 0) & (gain <= 8.0 * eps * state.squared + 4.0 * eps * jnp.sqrt(state.squared))
-        choice = _choose(state, point, reached | state.done)
-        closest, points, points_a, new_pieces, count = _apply(
-            state, point, point_a if tracked else None, pieces, choice
+        choice = _choose(state, state.points - point, point, reached | state.done | (state.turn == iterations))
+        source = _sources(choice)
+        points, points_a, new_pieces = jax.tree.map(
+            functools.partial(_follow, source),
+            (state.points, state.points_a, state.pieces),
+            (point, point_a if tracked else None, pieces),
         )
+        closest = _closest(state, points, choice, tracked)
+        count = jnp.where(choice >= TRIANGLE, 3, jnp.where(choice >= EDGE, 2, 1))
         overlap = (choice == INSIDE) | ((choice < INSIDE) & (dot(closest, closest) <= noise))
         keep = choice == KEEP
         return _State(
@@ -96,47 +120,63 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
             points=points,
             points_a=points_a,
             pieces=new_pieces,
-            count=count,
+            count=jnp.where(choice >= INSIDE, state.count, count),
             overlap=state.overlap | overlap,
             done=state.done | keep | overlap,
+            # A lane that is done keeps its direction, and with it these.
+            extreme=point,
+            extreme_pieces=pieces,
         )
 
     zero = jnp.zeros_like(start.x)
     one = zero + 1.0
     first = unit(start, Vec3(one, zero, zero))
     none = jnp.zeros(jnp.shape(zero), jnp.int32)
+    slots = first.map(lambda c: jnp.broadcast_to(c, (3, *c.shape)))
     state = _State(
         jnp.zeros((), jnp.int32),
         first,
         zero + jnp.inf,
-        (first,) * 3,
-        (first,) * 3 if tracked else None,
-        (none,) * 3,
+        slots,
+        slots if tracked else None,
+        jnp.broadcast_to(none, (3, *none.shape)),
         none,
         none < 0,
         ~wanted | (none < 0),
+        first,
+        none,
     )
-    state = lax.while_loop(lambda s: (s.turn < iterations) & ~jnp.all(s.done), advance, state)
-    pieces = (
-        state.pieces[0],
-        jnp.where(state.count > 1, state.pieces[1], state.pieces[0]),
-        jnp.where(state.count > 2, state.pieces[2], state.pieces[0]),
-    )
-    two, three = state.count > 1, state.count > 2
+    state = lax.while_loop(lambda s: (s.turn <= iterations) & ~jnp.all(s.done), advance, state)
+    used = state.count > lax.broadcasted_iota(jnp.int32, (3, *none.shape), 0)
+    slots = jax.tree.map(lambda x: jnp.where(used, x, x[0]), (state.pieces, state.points, state.points_a))
+    pieces, points, points_a = zip(*(_slot(slots, k) for k in range(3)), strict=True)
     point_a = point_b = None
-    if state.points_a is not None:
-        weights = barycentric(state.points, two, three)
-        point_a = combine(weights, state.points_a)
-        point_b = point_a + combine(weights, state.points) - shift
-    return Simplex(unit(state.closest, first), pieces, point_a, point_b, norm(state.closest), state.overlap)
+    if tracked:
+        weights = barycentric(points, state.count > 1, state.count > 2)
+        point_a = combine(weights, points_a)
+        point_b = point_a + combine(weights, points) - shift
+    direction, distance = unit(state.closest, first), norm(state.closest)
+    extreme = state.extreme - shift
+    return Simplex(
+        direction,
+        pieces,
+        None if tracked else tuple(point - shift for point in points),
+        point_a,
+        point_b,
+        distance,
+        state.overlap,
+        extreme,
+        state.extreme_pieces,
+        jnp.where(state.overlap, OVERLAPPED, dot(direction, extreme)),
+    )
 
 
-def _choose(state: _State, point: Vec3, stop: Array) -> Array:
-    """Settled choice of the sub-simplex of {newest point, slots} closest to the origin."""
+def _choose(state: _State, edges: Vec3, point: Vec3, stop: Array) -> Array:
+    """Settled choice of the sub-simplex of {newest point, slots} closest to the origin, by the edges to the slots."""
     best, code = dot(point, point), jnp.zeros_like(point.x)
     flatness = (FLAT_ROUNDING * float(jnp.finfo(best.dtype).eps)) ** 2
-    edges = [slot - point for slot in state.points]
-    for k, edge in enumerate(edges):
+    slots = [_slot(edges, k) for k in range(3)]
+    for k, edge in enumerate(slots):
         squared = dot(edge, edge)
         filled = (state.count > k) & (squared > 0)
         t = -dot(point, edge) / jnp.where(filled, squared, 1.0)
@@ -146,63 +186,55 @@ def _choose(state: _State, point: Vec3, stop: Array) -> Array:
         best, code = jnp.where(better, distance, best), jnp.where(better, float(EDGE + k), code)
     inside = state.count > 2
     for k, (i, j) in enumerate(TRIANGLE_SLOTS):
-        normal = cross(edges[i], edges[j])
+        normal = cross(slots[i], slots[j])
         squared = dot(normal, normal)
-        flat = squared <= flatness * dot(edges[i], edges[i]) * dot(edges[j], edges[j])
+        flat = squared <= flatness * dot(slots[i], slots[i]) * dot(slots[j], slots[j])
         filled = (state.count > j) & ~flat
         inverse = 1.0 / jnp.where(filled, squared, 1.0)
         height = dot(normal, point)
-        u = dot(normal, cross(edges[j], point)) * inverse
-        v = dot(normal, cross(point, edges[i])) * inverse
+        u = dot(normal, cross(slots[j], point)) * inverse
+        v = dot(normal, cross(point, slots[i])) * inverse
         distance = height * height * inverse
         better = filled & (u > 0) & (v > 0) & (u + v < 1) & (distance < best)
         best, code = jnp.where(better, distance, best), jnp.where(better, float(TRIANGLE + k), code)
         # The origin lies on the same side of this face as the fourth vertex.
-        inside &= dot(normal, edges[3 - i - j]) * height < 0
+        inside &= dot(normal, slots[3 - i - j]) * height < 0
     code = jnp.where(inside, float(INSIDE), code)
     stalled = stop | (~inside & (best >= state.squared))
     return settle_code(jnp.where(stalled, float(KEEP), code))
 
 
-def _apply(
-    state: _State, point: Vec3, point_a: Vec3 | None, pieces: Array, choice: Array
-) -> tuple[Vec3, tuple[Vec3, ...], tuple[Vec3, ...] | None, tuple[Array, ...], Array]:
-    """Closest point and simplex of a choice: the newest point in slot 0, its companions after it."""
-    keep = choice >= INSIDE
-    on_edge, on_triangle = (choice >= EDGE) & (choice < TRIANGLE), (choice >= TRIANGLE) & (choice < INSIDE)
+def _slot(values: Any, slot: int) -> Any:
+    return jax.tree.map(lambda x: x[slot], values)
+
+
+def _sources(choice: Array) -> Array:
+    """For each slot of the simplex of a choice the slot whose content it takes, `NEW` for the newest point."""
+    on_edge = (choice >= EDGE) & (choice < TRIANGLE)
     second = jnp.where(on_edge, choice - EDGE, jnp.where(choice == TRIANGLE + 2, 1, 0))
     third = jnp.where(choice == TRIANGLE, 1, 2)
+    slot = lax.broadcasted_iota(jnp.int32, (3, *choice.shape), 0)
+    return jnp.where(choice >= INSIDE, slot, jnp.where(slot == 0, NEW, jnp.where(slot == 1, second, third)))
 
-    def pick(index: Array, values: tuple) -> Vec3:
-        return where(index == 0, values[0], where(index == 1, values[1], values[2]))
 
-    def pick_code(index: Array, values: tuple) -> Array:
-        return jnp.where(index == 0, values[0], jnp.where(index == 1, values[1], values[2]))
+def _follow(source: Array, old: Array, new: Array) -> Array:
+    """The slots ``(slot, pair, world)`` of a simplex from those before and the newest point."""
+    return jnp.where(source == NEW, new, jnp.where(source == 0, old[0], jnp.where(source == 1, old[1], old[2])))
 
-    second_point, third_point = pick(second, state.points), pick(third, state.points)
-    edge, other = second_point - point, third_point - point
+
+def _closest(state: _State, points: Vec3, choice: Array, tracked: bool) -> Vec3:
+    """Point of a chosen simplex closest to the origin."""
+    on_edge, on_triangle = (choice >= EDGE) & (choice < TRIANGLE), (choice >= TRIANGLE) & (choice < INSIDE)
+    point = _slot(points, 0)
+    edge, other = _slot(points, 1) - point, _slot(points, 2) - point
     squared = dot(edge, edge)
     inverse = 1.0 / jnp.where(on_edge, squared, 1.0)
     foot = point - edge * (dot(point, edge) * inverse)
-    if point_a is None:
+    if not tracked:
         # Across the edge also where cancellation left little. Not for rims: a direction that misses their axis by less
         # than round-off has derivatives that overflow.
         foot = foot - edge * (dot(foot, edge) * inverse)
     normal = cross(edge, other)
     height = normal * (dot(normal, point) / jnp.where(on_triangle, dot(normal, normal), 1.0))
     closest = where(on_triangle, height, where(on_edge, foot, point))
-
-    def following(new: Vec3, old: tuple[Vec3, ...]) -> tuple[Vec3, ...]:
-        return tuple(where(keep, o, n) for o, n in zip(old, (new, pick(second, old), pick(third, old)), strict=True))
-
-    return (
-        where(keep, state.closest, closest),
-        following(point, state.points),
-        None if point_a is None or state.points_a is None else following(point_a, state.points_a),
-        (
-            jnp.where(keep, state.pieces[0], pieces),
-            jnp.where(keep, state.pieces[1], pick_code(second, state.pieces)),
-            jnp.where(keep, state.pieces[2], pick_code(third, state.pieces)),
-        ),
-        jnp.where(keep, state.count, jnp.where(on_triangle, 3, jnp.where(on_edge, 2, 1))),
-    )
+    return where(choice >= INSIDE, state.closest, closest)

@@ -27,7 +27,7 @@ from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm, tangent_basis, where
 
-POLYTOPE_STEPS, CURVED_STEPS = 4, 12
+STEPS = 12
 """Most Newton steps; all lanes stop as soon as they have converged."""
 LONGEST_STEP = 0.5
 """Newton steps turn the normal by at most this angle [rad]; a longer one means that the pieces are not the right ones."""
@@ -47,7 +47,8 @@ STIFFNESS_ROUNDING = 64.0
 class Closest(NamedTuple):
     """Unit normal from A to B and the closest points of the cores, in the frame of A, in units of the scale.
 
-    `consistent`: no other piece undercuts the tied ones. `inside`: the points are known to belong to their cores.
+    `consistent`: no other piece undercuts the tied ones. `inside`: the points are known to belong to their cores. `reach`:
+    true separation along the normal, a lower bound, not differentiated.
     """
 
     normal: Vec3
@@ -56,6 +57,7 @@ class Closest(NamedTuple):
     ties: Ties
     consistent: Array
     inside: Array
+    reach: Array
 
 
 class Solution(NamedTuple):
@@ -82,7 +84,7 @@ class _Search(NamedTuple):
 def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
     """Exact closest points from what `solve` found for the closest simplex. Differentiable in the shapes."""
     simplex, solution = lax.stop_gradient((simplex, solution))
-    rounding = _rounding(shapes)
+    rounding = rounding_of(shapes)
     ties = solution.ties
     normal = compute_once(_implicit_normal(shapes, solution.normal, ties, solution.exact), solution.separation)
     points = _tied_points(shapes, ties, normal)
@@ -105,11 +107,11 @@ def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
         ties,
         solution.exact,
         lowest >= -rounding,
+        solution.separation,
     )
-    best = solution.separation
     for of_b, kind in enumerate((shapes.kind_a, shapes.kind_b)):
         if SUPPORT[kind].rim_radius is not None:
-            result, best = _flat_end(shapes, simplex, result, best, bool(of_b), rounding)
+            result = _flat_end(shapes, simplex, result, bool(of_b), rounding)
     return result
 
 
@@ -136,7 +138,7 @@ def _implicit_normal_jvp(primals: tuple, tangents: tuple) -> tuple[Vec3, Vec3]:
     shapes, start, ties, exact = primals
 
     def step(shapes: Difference) -> Vec3:
-        return _step(shapes, ties, start, _differences(_tied_points(shapes, ties, start)))
+        return newton_step(shapes, ties, start, _differences(_tied_points(shapes, ties, start)))
 
     _, change = jax.jvp(step, (shapes,), (tangents[0],))
     none = change.map(jnp.zeros_like)
@@ -144,7 +146,7 @@ def _implicit_normal_jvp(primals: tuple, tangents: tuple) -> tuple[Vec3, Vec3]:
 
 
 def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
-    """Tied pieces and normal of the solution, by Newton's method with an active set.
+    """Tied pieces and normal of the solution of shapes of which one has a rim, by Newton's method with an active set.
 
     The true separation along any direction is a lower bound of the separation: the best direction seen is kept, and a
     piece that undercuts the tied ones joins them.
@@ -154,49 +156,51 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
         simplex: The closest simplex that the search found.
         wanted: bool, False where the result is not needed: those lanes stop at once.
     """
-    rounding = _rounding(shapes)
+    rounding = rounding_of(shapes)
 
     def advance(state: _Search) -> _Search:
         points = stacked_differences(shapes, state.ties, state.normal)
-        normal = compute_once(_step(shapes, state.ties, state.normal, points), state.best.separation)
-        if curved:
-            points = stacked_differences(shapes, state.ties, normal)
-        model = dot(normal, points[0])
+        normal = compute_once(newton_step(shapes, state.ties, state.normal, points), state.best.separation)
+        points = stacked_differences(shapes, state.ties, normal)
         extreme, pieces = shapes.least(normal)
         reach = dot(normal, extreme)
         turned = normal - state.normal
         weights = barycentric(points, state.ties.two, state.ties.three)
-        sound = True
-        if curved:
-            # Where a piece pair has left, what remains must have its closest point along the normal.
-            across = combine(weights, points)
-            across = across - normal * dot(normal, across)
-            sound = ~state.left | (dot(across, across) <= max(8.0 * rounding, ASIDE) ** 2)
-        consistent = model - reach <= 4.0 * rounding
-        best = state.best
-        code = (reach > best.separation).astype(reach.dtype) + 2.0 * (reach > best.separation - rounding)
-        code = settle_code(jnp.where(state.done, 0.0, code + 4.0 * consistent + 8.0 * sound))
-        # Near the solution the separation is flat: the latest consistent normal is the best, to more than half the digits.
-        better = (code & 14 == 14) | ((code & 1 == 1) & ~best.exact)
-        exact = (code & 4) == 4
-        here = Solution(normal, reach, state.ties, exact)
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), here, best)
+        # Where a piece pair has left, what remains must have its closest point along the normal.
+        across = combine(weights, points)
+        across = across - normal * dot(normal, across)
+        sound = ~state.left | (dot(across, across) <= max(8.0 * rounding, ASIDE) ** 2)
+        best, exact = better(
+            state.best,
+            Solution(normal, reach, state.ties, dot(normal, points[0]) <= reach + 4.0 * rounding),
+            sound,
+            state.done,
+            rounding,
+        )
         still = dot(turned, turned) <= rounding * rounding
         ties = join(state.ties, pieces, weights, ~exact)
-        if not curved:
-            return _Search(state.turn + 1, normal, ties, best, state.left, state.done | exact)
         ties, leaves = leave(ties, weights, rounding, exact)
-        return _Search(state.turn + 1, normal, ties, best, state.left | leaves, state.done | (exact & still & ~leaves))
+        done = state.done | (exact & still & ~leaves)
+        return _Search(state.turn + 1, normal, ties, best, state.left | leaves, done)
 
-    curved = _curved(shapes)
-    extreme, pieces = shapes.least(simplex.direction)
-    reach = dot(simplex.direction, extreme)
-    first = Solution(simplex.direction, reach, single(pieces), jnp.zeros(reach.shape, bool))
+    first = Solution(simplex.direction, simplex.reach, single(simplex.extreme_pieces), wanted & ~wanted)
     state = _Search(
         jnp.zeros((), jnp.int32), simplex.direction, distinct(simplex.pieces), first, wanted & ~wanted, ~wanted
     )
-    steps = CURVED_STEPS if curved else POLYTOPE_STEPS
-    return lax.while_loop(lambda s: (s.turn < steps) & ~jnp.all(s.done), advance, state).best
+    return lax.while_loop(lambda s: (s.turn < STEPS) & ~jnp.all(s.done), advance, state).best
+
+
+def better(best: Solution, here: Solution, sound: Array | bool, done: Array, rounding: float) -> tuple[Solution, Array]:
+    """The better of two solutions, and whether the second is exact, both settled; the first and no where `done`.
+
+    Near the solution the separation is flat: the latest exact normal is the best, to more than half the digits.
+    """
+    reach = here.separation
+    code = (reach > best.separation).astype(reach.dtype) + 2.0 * (reach > best.separation - rounding)
+    code = settle_code(jnp.where(done, 0.0, code + 4.0 * here.exact + 8.0 * sound))
+    exact = (code & 4) == 4
+    replaces = (code & 14 == 14) | ((code & 1 == 1) & ~best.exact)
+    return jax.tree.map(lambda new, old: jnp.where(replaces, new, old), here._replace(exact=exact), best), exact
 
 
 def _curved(shapes: Difference) -> bool:
@@ -204,7 +208,8 @@ def _curved(shapes: Difference) -> bool:
     return any(SUPPORT[kind].rim_radius is not None for kind in (shapes.kind_a, shapes.kind_b))
 
 
-def _rounding(shapes: Difference) -> float:
+def rounding_of(shapes: Difference) -> float:
+    """Separations [size] that differ by less are equal."""
     return ROUNDING * float(jnp.finfo(shapes.position.x.dtype).eps)
 
 
@@ -260,7 +265,7 @@ def _differences(points: list[tuple[Vec3, Vec3]]) -> list[Vec3]:
     return [b - a for a, b in points]
 
 
-def _step(shapes: Difference, ties: Ties, normal: Vec3, points: list[Vec3]) -> Vec3:
+def newton_step(shapes: Difference, ties: Ties, normal: Vec3, points: list[Vec3]) -> Vec3:
     """One Newton step for the normal, from the difference points of the ties along it."""
     eps = float(jnp.finfo(normal.x.dtype).eps)
     weights = barycentric(points, ties.two, ties.three)
@@ -333,15 +338,13 @@ def _climb_in_plane(force_1: Array, force_2: Array, k11: Array, k12: Array, k22:
     return x * stiff - y * soft, y * stiff + x * soft
 
 
-def _flat_end(
-    shapes: Difference, simplex: Simplex, result: Closest, best: Array, of_b: bool, rounding: float
-) -> tuple[Closest, Array]:
+def _flat_end(shapes: Difference, simplex: Simplex, result: Closest, of_b: bool, rounding: float) -> Closest:
     """Contact with the flat end of a cylinder or cone, where its axis separates best: the end's normal is exact.
 
     The other body's point is its extreme one. Where the search's point is extreme too (parallel faces) it is taken,
     carried along by the body: it lies over the end.
     """
-    frozen = lax.stop_gradient(shapes)
+    frozen, best = lax.stop_gradient(shapes), result.reach
     axis = shapes.rotation.column_y if of_b else Vec3(*(jnp.full_like(best, c) for c in (0.0, 1.0, 0.0)))
     upward = settle_code((dot(lax.stop_gradient(axis), simplex.direction) >= 0).astype(best.dtype)) == 1
     normal = axis * jnp.where(upward, 1.0, -1.0)
@@ -371,14 +374,12 @@ def _flat_end(
     chosen = settle_code((level & over).astype(best.dtype)) == 1
     gap = dot(normal, point_b - point_a)
     point_a, point_b = (other, other + normal * gap) if of_b else (other - normal * gap, other)
-    return (
-        Closest(
-            where(chosen, normal, result.normal),
-            where(chosen, point_a, result.point_a),
-            where(chosen, point_b, result.point_b),
-            jax.tree.map(lambda new, old: jnp.where(chosen, new, old), single(pieces), result.ties),
-            chosen | result.consistent,
-            ~chosen & result.inside,
-        ),
+    return Closest(
+        where(chosen, normal, result.normal),
+        where(chosen, point_a, result.point_a),
+        where(chosen, point_b, result.point_b),
+        jax.tree.map(lambda new, old: jnp.where(chosen, new, old), single(pieces), result.ties),
+        chosen | result.consistent,
+        ~chosen & result.inside,
         jnp.where(chosen, along, best),
     )

@@ -60,6 +60,8 @@ class _Lifted(NamedTuple):
 def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: float) -> tuple[Simplex, Array]:
     """Closest simplex of two polytopes, and an upper bound of their separation.
 
+    Where a better direction than that of the simplex is known, it has this direction, and no distance.
+
     Args:
         shapes: The shapes, not differentiated.
         a: The core of A, in its own frame and in units of the size.
@@ -70,15 +72,19 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
     def turn(state: _Lifted) -> _Lifted:
         found = gjk(shapes, state.start, state.shift, ~state.done, POLYTOPE_ITERATIONS)
         first = state.turn == 0
-        reach = _reach(shapes, found)
+        axis_separation = LIFT - dot(state.shift, state.start)
         # From an axis that all but meets a corner the search returns at once, with the round-off of the lift in its angle.
-        lost = ~first & (LIFT - dot(state.shift, state.start) > reach + tolerance)
-        kept = found._replace(direction=where(lost, state.start, found.direction))
+        lost = ~first & (axis_separation > found.reach + tolerance)
+        kept = found._replace(
+            direction=where(lost, state.start, found.direction),
+            distance=jnp.where(lost, 0.0, found.distance),
+            reach=jnp.where(lost, axis_separation, found.reach),
+        )
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), kept, state.simplex)
-        wanted = first & (found.overlap | _stalled(found, reach, tolerance))
+        wanted = first & (found.overlap | _stalled(found, tolerance))
         axis = separating_axis(shapes, a, b, wanted)
         # The test knows no axis from a corner: of shapes that are apart it may find less than the search did.
-        wanted &= found.overlap | (axis.separation > reach)
+        wanted &= found.overlap | (axis.separation > found.reach)
         upper = jnp.where(first, jnp.where(found.overlap, axis.separation, found.distance), state.upper)
         shift = axis.direction * (LIFT - axis.separation)
         return _Lifted(state.turn + 1, simplex, axis.direction, shift, upper, ~wanted)
@@ -86,24 +92,22 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
     # Both searches are turns of one loop, so that they are compiled once.
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
-    state = _Lifted(jnp.zeros((), jnp.int32), _no_simplex(vector, None), shapes.position, vector, zero, zero > 0)
+    state = _Lifted(
+        jnp.zeros((), jnp.int32), _no_simplex(vector, polytopes=True), shapes.position, vector, zero, zero > 0
+    )
     state = lax.while_loop(lambda s: (s.turn < 2) & ~jnp.all(s.done), turn, state)
     return state.simplex, state.upper
 
 
-def _reach(shapes: Difference, found: Simplex) -> Array:
-    """True separation along the direction of a simplex: a lower bound."""
-    return dot(found.direction, shapes.least(found.direction)[0])
-
-
-def _stalled(found: Simplex, reach: Array, tolerance: float) -> Array:
+def _stalled(found: Simplex, tolerance: float) -> Array:
     """Whether the search stalled on a needle of a simplex, close to touch: its direction proves nothing."""
-    return (found.distance < CLOSE) & (reach < found.distance - tolerance)
+    return (found.distance < CLOSE) & (found.reach < found.distance - tolerance)
 
 
-def _no_simplex(zero: Vec3, point: Vec3 | None) -> Simplex:
+def _no_simplex(zero: Vec3, *, polytopes: bool) -> Simplex:
     none = jnp.zeros(zero.x.shape, jnp.int32)
-    return Simplex(zero, (none, none, none), point, point, zero.x, none < 0)
+    points, point = ((zero,) * 3, None) if polytopes else (None, zero)
+    return Simplex(zero, (none,) * 3, points, point, point, zero.x, none < 0, zero, none, zero.x)
 
 
 class _Search(NamedTuple):
@@ -139,7 +143,7 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
             lambda new, old: jnp.where(state.done, old, new), (found, solved), (state.simplex, state.solution)
         )
         overlap = jnp.where(first, found.overlap, state.overlap)
-        wanted = jnp.where(first, found.overlap | _stalled(found, _reach(shapes, found), tolerance), ~state.done)
+        wanted = jnp.where(first, found.overlap | _stalled(found, tolerance), ~state.done)
         cap = proved_cap(shapes, solution, tolerance)
         least = epa(shapes, solution.normal, cap.half, wanted & ~first & ~cap.whole, PROOF, tolerance)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
@@ -158,7 +162,7 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
     zero = jnp.zeros_like(shapes.position.x)
     vector = Vec3(zero, zero, zero)
     no = zero > 0
-    none = _no_simplex(vector, vector)
+    none = _no_simplex(vector, polytopes=False)
     state = _Search(
         jnp.zeros((), jnp.int32),
         none,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mathota_jax.collision.closest import clamp_to_box, round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.settle import settle_code
+from mathota_jax.spatial.settle import settle_code, store_cotangents
 from mathota_jax.spatial.vector import Vec3, dot, where
 
 
@@ -15,7 +15,7 @@ def sphere_box(sphere: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose_b
     """One contact; exact outside and inside: a centre inside the box leaves through the nearest face."""
     assert pose_b.rotation is not None
     half = box["half_extents"]
-    center = pose_b.point_to_local(pose_a.position)
+    center = store_cotangents(pose_b.point_to_local(pose_a.position))
     nearest = clamp_to_box(center, half)
     outward = center - nearest
     squared = dot(outward, outward)
@@ -32,7 +32,7 @@ def sphere_box(sphere: dict[str, Any], pose_a: Pose, box: dict[str, Any], pose_b
     surface = Vec3(
         *(jnp.where(~outside & (axis == k), sign * h, q) for k, (q, h) in enumerate(zip(nearest, half, strict=True)))
     )
-    normal_w = -pose_b.rotation.apply(normal)
+    normal_w = store_cotangents(-pose_b.rotation.apply(normal))
     point = round_point(pose_a.position, pose_b.point_to_world(surface), normal_w, sphere["radius"], 0.0)
     return Manifold(normal_w, (point,))
 
