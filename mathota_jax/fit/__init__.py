@@ -2,7 +2,7 @@
 
 from mathota_jax.fit.files import load, load_csv, load_npz, save_npz
 from mathota_jax.fit.fitting import fit
-from mathota_jax.fit.objective import Noise
+from mathota_jax.fit.objective import Noise, Spread
 from mathota_jax.fit.parameters import Parameter
 from mathota_jax.fit.quantities import QUANTITIES
 from mathota_jax.fit.result import FitResult, StartResult
@@ -13,6 +13,7 @@ __all__ = [
     "FitResult",
     "Noise",
     "Parameter",
+    "Spread",
     "StartResult",
     "Trajectories",
     "fit",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,9 @@ COLUMNS = {
 
 GRID_TOLERANCE = 0.01
 """How far a time may be from a whole number of frames, in frames."""
+
+SPARSEST = 1000
+"""Frames for each line of a CSV file; more come from two times that are nearly equal."""
 
 
 def load(path: str | Path) -> Trajectories:
@@ -92,17 +96,7 @@ def load_csv(path: str | Path) -> Trajectories:
         ValueError: unknown or missing columns, a cell that is no number, times off the grid, a frame given twice, or
             arrays that are not valid; the message names the line.
     """
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file)
-        header = [name.strip() for name in reader.fieldnames or ()]
-        channels = _channels(path, header)
-        rows = []
-        for cells in reader:
-            if None in cells or None in cells.values():
-                raise ValueError(f"{path}, line {reader.line_num}: expected {len(header)} cells")
-            rows.append((reader.line_num, dict(zip(header, cells.values(), strict=True))))
-    if not rows:
-        raise ValueError(f"{path}: there is no line below the header")
+    channels, rows = _lines(path)
     times = [_number(path, line, "time", row["time"]) for line, row in rows]
     if not np.all(np.isfinite(times)):
         raise ValueError(f"{path}, line {rows[int(np.argmin(np.isfinite(times)))][0]}: the time is missing")
@@ -115,9 +109,14 @@ def load_csv(path: str | Path) -> Trajectories:
     for frame, (line, _) in zip(frames, rows, strict=True):
         if abs(frame - round(frame)) > GRID_TOLERANCE:
             raise ValueError(
-                f"{path}, line {line}: the time is {frame:.3f} frames of {dt:g} s after the start of its trajectory; "
-                "times must lie on a grid of constant spacing"
+                f"{path}, line {line}: the time is {frame * dt:g} s after the start of its trajectory, no whole number of "
+                f"frames of {dt:g} s, which fit all times best; times must lie on a grid of constant spacing"
             )
+    if max(frames) > SPARSEST * len(rows):
+        raise ValueError(
+            f"{path}: with frames of {dt:g} s, the smallest difference of times, there are {max(frames):.3g} frames for "
+            f"{len(rows)} lines; times that are meant to be one must be equal"
+        )
     shape = (len(order), round(max(frames)) + 1, len(bodies))
     arrays = {channel: np.full((*shape, CHANNELS[channel]), np.nan) for channel in channels}
     seen: dict[tuple[int, int, int], int] = {}
@@ -132,6 +131,28 @@ def load_csv(path: str | Path) -> Trajectories:
         return Trajectories(bodies, dt, **arrays)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _lines(path: str | Path) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Channels of a CSV file, and its lines: number and cells by column."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file in UTF-8 ({error})") from error
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    header = [name.strip() for name in reader.fieldnames or ()]
+    channels = _channels(path, header)
+    rows = []
+    for cells in reader:
+        if None in cells or None in cells.values():
+            raise ValueError(f"{path}, line {reader.line_num}: expected {len(header)} cells")
+        row = dict(zip(header, cells.values(), strict=True))
+        if not row["body"].strip():
+            raise ValueError(f"{path}, line {reader.line_num}: the name of the body is missing")
+        rows.append((reader.line_num, row))
+    if not rows:
+        raise ValueError(f"{path}: there is no line below the header")
+    return channels, rows
 
 
 def _channels(path: str | Path, header: list[str]) -> list[str]:

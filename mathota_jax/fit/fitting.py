@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from numbers import Integral, Real
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 from mathota_jax.fit.initial_states import Motion
 from mathota_jax.fit.least_squares import Progress, Solution, Stage, levenberg_marquardt
 from mathota_jax.fit.normal_equations import Weights, normal_equations, robust_factor, stack_starts
-from mathota_jax.fit.objective import Noise, Objective
+from mathota_jax.fit.objective import Noise, Objective, Spread
 from mathota_jax.fit.optimise import optimise, require_optax
 from mathota_jax.fit.parameters import Parameter, parameter_vector
 from mathota_jax.fit.result import FitResult, StartResult
@@ -23,6 +24,8 @@ from mathota_jax.model import Model
 from mathota_jax.state import State
 
 STARTS = ("recorded", "free", "model")
+FAR = 4.0
+"""Spreads that a beginning may lie off the scene without a warning."""
 CONTINUITY = (1.0, 10.0, 100.0)
 """Weights of the jumps between segments, one stage each: loose first, in the end a hundredth of the noise."""
 
@@ -35,6 +38,7 @@ def fit(
     *,
     start: str = "free",
     noise: Noise | None = None,
+    spread: Spread | None = None,
     substeps: int = 1,
     segments: int = 1,
     horizons: Sequence[float] = (1.0,),
@@ -58,6 +62,8 @@ def fit(
             complete; its noise then goes into the estimates. "model": in `state`, the same for all trajectories; then
             `position[body]`, `velocity[body]` and `angular_velocity[body]` may be parameters.
         noise: standard deviations of the channels.
+        spread: standard deviations of what was not recorded at the beginning of a trajectory (orientations where there are
+            positions alone, bodies that were not recorded) about `state`, with start="free".
         substeps: steps of the engine between two frames.
         segments: of multiple shooting (H. Bock and K. Plitt, 1984). Trajectories are cut into as many pieces, whose
             beginnings are unknowns, tied together ever tighter: long or chaotic motions then converge from far starts.
@@ -81,20 +87,32 @@ def fit(
         ImportError: `optimiser` is given and optax is not installed.
     """
     if not isinstance(data, Trajectories):
-        raise ValueError(f"fit: data must be Trajectories, got {type(data).__name__}")
+        raise ValueError(f"fit: data must be Trajectories, got {_kind(data)}")
+    if not isinstance(model, Model) or not isinstance(state, State):
+        raise ValueError(f"fit: give model, state as `build` returns them, got {_kind(model)}, {_kind(state)}")
+    noise = Noise() if noise is None else noise
+    spread = Spread() if spread is None else spread
+    for name, value, kind in (("noise", noise, Noise), ("spread", spread, Spread)):
+        if not isinstance(value, kind):
+            raise ValueError(f"fit: {name} must be a {kind.__name__}, such as {kind()}, got {value!r}")
     vector = parameter_vector(model, state, parameters)
     data.check_scene(model)
-    noise = Noise() if noise is None else noise
     _check_settings(
         data, vector.initial, start, substeps, segments, horizons, huber, start_count, step_limit, confidence
     )
     if optimiser is not None:
         require_optax()
-    objective = Objective(model, state, vector, data, noise, segments, substeps, start)
+        if not hasattr(optimiser, "update"):
+            raise ValueError(f"fit: optimiser must be one of optax, such as optax.adam(0.02), got {optimiser!r}")
+    objective = Objective(model, state, vector, data, noise, segments, substeps, start, spread)
     if not objective.used:
         raise ValueError("fit: no recorded channel has a noise; nothing is compared")
     begin = vector.random_starts(start_count, seed)
     return solve(objective, begin, horizons, huber, optimiser, step_limit, confidence, progress)
+
+
+def _kind(value: Any) -> str:
+    return type(value).__name__
 
 
 def solve(
@@ -143,20 +161,24 @@ def _check_settings(
         ("start_count", start_count),
         ("step_limit", step_limit),
     ):
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
             raise ValueError(f"fit: {name} must be a whole number of at least 1, got {value!r}")
     if segments > data.frame_count - 1:
         raise ValueError(
             f"fit: segments must be at most the {data.frame_count - 1} frames after the first, got {segments}"
         )
-    shares = list(horizons)
+    shares = list(horizons) if isinstance(horizons, Iterable) else []
+    if not all(isinstance(share, Real) for share in shares):
+        raise ValueError(f"fit: horizons must be numbers, got {horizons!r}")
     if not shares or shares[-1] != 1 or shares[0] <= 0 or any(b <= a for a, b in itertools.pairwise(shares)):
-        raise ValueError(f"fit: horizons must be positive and increasing and end with 1, got {horizons!r}")
+        raise ValueError(
+            f"fit: horizons must be positive and increasing and end with 1, such as (0.3, 1.0), got {horizons!r}"
+        )
     if segments > 1 and len(shares) > 1:
         raise ValueError("fit: give either several segments or several horizons, not both")
-    if huber is not None and not (huber > 0 and math.isfinite(huber)):
+    if huber is not None and not (isinstance(huber, Real) and huber > 0 and math.isfinite(huber)):
         raise ValueError(f"fit: huber must be a positive number of standard deviations, got {huber!r}")
-    if not 0 < confidence < 1:
+    if not (isinstance(confidence, Real) and 0 < confidence < 1):
         raise ValueError(f"fit: confidence must lie between 0 and 1, got {confidence!r}")
 
 
@@ -201,7 +223,15 @@ def _result(
     )
     warnings = list(found_out.warnings)
     if not solution.converged[best]:
-        warnings.append(f"Not converged after {solution.steps} steps; raise the limit or start closer.")
+        warnings.append(
+            f"Not converged after {solution.steps} steps: raise the limit, or start closer where no step lowers the cost."
+        )
+    warnings += [
+        f"The {leaf.replace('_', ' ')} of '{body}', which was not recorded, begins up to {away:.2g} spreads off the scene: "
+        "give a wider one (`spread`) if the scene's may be that wrong."
+        for (body, leaf), away in objective.pulled(charts).items()
+        if away > FAR
+    ]
     near = solution.cost <= solution.cost[best] * 1.01 + 1e-12
     if len(near) > 1 and near.sum() == 1:
         warnings.append(f"Only one of {len(near)} starts reached the lowest cost; a lower one may exist.")

@@ -1,14 +1,13 @@
 """Where simulated trajectories and the segments of multiple shooting begin: guesses from the data, and changes of them.
 
-A *motion* is a tuple (position (body, 3), orientation (body, 4), velocity (body, 3), angular velocity (body, 3)) of all
-bodies of the scene; its chart has 12 numbers for each moving body: displacement [m], rotation vector [rad], change of
-velocity [m/s] and of angular velocity [rad/s], world frame.
+The chart of a `Motion` has 12 numbers for each moving body: displacement [m], rotation vector [rad], changes of velocity
+[m/s] and of angular velocity [rad/s], world frame.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +19,22 @@ from mathota_jax.fit.trajectories import Trajectories
 from mathota_jax.model import Model
 from mathota_jax.state import State
 
-Motion = tuple[Any, Any, Any, Any]
+
+class Motion(NamedTuple):
+    """Motions of all bodies of the scene; leaves may have further axes in front.
+
+    Attributes:
+        position: (body, 3) [m].
+        orientation: (body, 4).
+        velocity: (body, 3) [m/s].
+        angular_velocity: (body, 3) [rad/s].
+    """
+
+    position: Any
+    orientation: Any
+    velocity: Any
+    angular_velocity: Any
+
 
 CHART = 12
 """Numbers of the chart for each moving body."""
@@ -31,7 +45,7 @@ WINDOW = 5
 
 def motion_of(state: State) -> Motion:
     """The motion of all bodies."""
-    return state.position, state.orientation, state.velocity, state.angular_velocity
+    return Motion(state.position, state.orientation, state.velocity, state.angular_velocity)
 
 
 def with_motion(state: State, motion: Motion) -> State:
@@ -51,7 +65,7 @@ def changed(motion: Motion, chart: Array, moving: tuple[int, ...]) -> Motion:
     position, orientation, velocity, angular_velocity = motion
     step = jnp.reshape(chart, (len(moving), 4, 3))
     index = jnp.asarray(moving)
-    return (
+    return Motion(
         position.at[index].add(step[:, 0]),
         orientation.at[index].set(turned(step[:, 1], orientation[index])),
         velocity.at[index].add(step[:, 2]),
@@ -67,8 +81,12 @@ def difference(first: Motion, second: Motion, moving: tuple[int, ...]) -> Array:
     return jnp.ravel(jnp.stack((shift, turn, speed, spin), 1))
 
 
-def guesses(model: Model, state: State, data: Trajectories, frames: list[int], recorded: bool) -> Motion:
-    """Motions of all bodies at some frames of each trajectory, leaves (trajectory, frame, body, ...), NumPy float64.
+def guesses(
+    model: Model, state: State, data: Trajectories, frames: list[int], recorded: bool
+) -> tuple[Motion, np.ndarray]:
+    """Motions of all bodies at some frames of each trajectory, and which of their leaves the data tell.
+
+    The motions have leaves (trajectory, frame, body, ...), NumPy float64; what is told (trajectory, frame, body, leaf).
 
     Positions and orientations are those recorded at the frame, or the nearest recorded ones moved along by the velocity;
     velocities are recorded ones, or the slope over the nearest frames. Bodies and channels that were not recorded keep
@@ -89,15 +107,17 @@ def guesses(model: Model, state: State, data: Trajectories, frames: list[int], r
     names = model.scene.body_names
     outer = (data.count, len(frames))
     motion = [np.broadcast_to(np.asarray(leaf, float), (*outer, *leaf.shape)).copy() for leaf in motion_of(state)]
+    told = np.zeros((*outer, len(names), len(motion)), bool)
     for column, body in enumerate(data.bodies):
         index = names.index(body)
         for trajectory in range(data.count):
             for place, frame in enumerate(frames):
                 found = _guess(data, trajectory, column, frame)
+                told[trajectory, place, index] = [value is not None for value in found]
                 for leaf, value in zip(motion, found, strict=True):
                     if value is not None:
                         leaf[trajectory, place, index] = value
-    return tuple(motion)  # type: ignore[return-value]
+    return Motion(*motion), told
 
 
 def _check_recorded(data: Trajectories) -> None:

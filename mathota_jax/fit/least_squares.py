@@ -19,6 +19,9 @@ TOLERANCE = 1e-6
 ROUND_OFF = 1e-5
 """Relative decrease foreseen below which a refused step is put down to round-off of the cost (float32)."""
 
+PROMISE = 0.01
+"""Relative decrease foreseen above which a start whose every step is refused, be it ever so short, has not converged."""
+
 Progress = Callable[[int, int, float], Any]
 """Called after each step with the steps done, their limit and the lowest cost."""
 
@@ -73,14 +76,15 @@ def levenberg_marquardt(
     for stage in stages:
         weights = stage.weights
         costs = np.asarray([cost(part.residual, part.gap, weights) for part in parts])
-        damping, growth = np.full(count, FIRST_DAMPING), np.full(count, 2.0)
+        damping, growth, promised = np.full(count, FIRST_DAMPING), np.full(count, 2.0), np.zeros(count)
         converged = ~np.isfinite(costs)
+        stuck = np.zeros(count, bool)
         for _ in range(stage.step_limit):
-            if converged.all():
+            if (converged | stuck).all():
                 break
             trial, trial_charts = unbounded.copy(), charts.copy()
             foreseen = np.zeros(count)
-            for b in np.flatnonzero(~converged):
+            for b in np.flatnonzero(~converged & ~stuck):
                 equations = normal_equations(parts[b], weights, free)
                 change, chart_change = solve(equations, damping[b])
                 slope = equations.gradient @ change + np.sum(equations.start_gradient * chart_change)
@@ -88,18 +92,21 @@ def levenberg_marquardt(
                 trial[b] += change
                 trial_charts[b].reshape(len(chart_change), -1)[:, free] += chart_change
             found = objective.linearise(trial, trial_charts)
-            for b in map(int, np.flatnonzero(~converged)):
+            for b in map(int, np.flatnonzero(~converged & ~stuck)):
                 part = stack_starts(found, b)
                 new = cost(part.residual, part.gap, weights)
                 if all(np.isfinite(leaf).all() for leaf in part) and new <= costs[b]:
                     converged[b] = costs[b] - new <= TOLERANCE * costs[b]
                     unbounded[b], charts[b], parts[b], costs[b] = trial[b], trial_charts[b], part, new
-                    damping[b], growth[b] = max(damping[b] / 5.0, LEAST_DAMPING), 2.0
+                    damping[b], growth[b], promised[b] = max(damping[b] / 5.0, LEAST_DAMPING), 2.0, 0.0
                 else:
                     # Ever faster, as H. Nielsen (1999) has it: the way from Gauss-Newton to small steps is short.
                     damping[b] *= growth[b]
                     growth[b] *= 2.0
-                    converged[b] = damping[b] > LARGEST_DAMPING or foreseen[b] <= ROUND_OFF * costs[b]
+                    promised[b] = max(promised[b], foreseen[b])
+                    ended = damping[b] > LARGEST_DAMPING or foreseen[b] <= ROUND_OFF * costs[b]
+                    stuck[b] = ended and promised[b] > PROMISE * costs[b]
+                    converged[b] = ended and not stuck[b]
             steps += 1
             if progress is not None:
                 progress(steps, limit, float(costs.min()))

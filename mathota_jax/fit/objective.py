@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from numbers import Real
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,9 @@ from mathota_jax.fit.trajectories import CHANNELS, Trajectories
 from mathota_jax.model import Model
 from mathota_jax.state import State
 from mathota_jax.step import step
+
+PULL = "pull"
+"""Key of `Segments.pull` beside the channels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +48,38 @@ class Noise:
             value = getattr(self, field.name)
             if value is None and field.name in ("velocity", "angular_velocity"):
                 continue
-            if not isinstance(value, int | float) or not (value > 0 and math.isfinite(value)):
-                raise ValueError(f"Noise.{field.name} must be a positive finite number, got {value!r}")
+            object.__setattr__(self, field.name, _positive(f"Noise.{field.name}", value))
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """Standard deviations of what was not recorded at the beginning of a trajectory, about the state of the scene.
+
+    Orientations that no one recorded are unknowns like all others. Left to themselves they explain anything: a puck of which
+    the positions are known slides as far with more friction if it spins on its edge. Where the data do tell of them, these
+    widths hardly matter. Bodies in joints are left to themselves: where one is told where it is, another can not stay.
+
+    Attributes:
+        position: [m].
+        orientation: of each component of the rotation vector [rad].
+        velocity: [m/s].
+        angular_velocity: [rad/s].
+    """
+
+    position: float = 0.01
+    orientation: float = 0.1
+    velocity: float = 0.1
+    angular_velocity: float = 0.3
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            object.__setattr__(self, field.name, _positive(f"Spread.{field.name}", getattr(self, field.name)))
+
+
+def _positive(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, Real) or not (float(value) > 0 and math.isfinite(value)):
+        raise ValueError(f"{name} must be a positive finite number, got {value!r}")
+    return float(value)
 
 
 class Segments(NamedTuple):
@@ -56,12 +90,14 @@ class Segments(NamedTuple):
         observed: channel -> (trajectory, segment, frame, body, component), frame 0 being the beginning of the segment;
             NaN where nothing was recorded or another segment has the frame.
         action: (trajectory, segment, frame - 1, motor).
+        pull: (trajectory, segment, chart) 1 / spread of the numbers of the beginnings that nothing was recorded of, else 0.
         frames: (segment, frame) index of each frame in the trajectory.
     """
 
     start: Motion
     observed: dict[str, np.ndarray]
     action: np.ndarray
+    pull: np.ndarray
     frames: np.ndarray
 
 
@@ -86,7 +122,7 @@ class Linearised(NamedTuple):
     gap_by_next: Any
 
 
-def cut(model: Model, state: State, data: Trajectories, segment_count: int, start: str) -> Segments:
+def cut(model: Model, state: State, data: Trajectories, segment_count: int, start: str, spread: Spread) -> Segments:
     """Segments of the data.
 
     Args:
@@ -96,6 +132,7 @@ def cut(model: Model, state: State, data: Trajectories, segment_count: int, star
         segment_count: number of segments.
         start: "model": trajectories begin in the state of the scene; "recorded": in their first frame; "free": the first
             frame is a guess and its residuals count.
+        spread: of what was not recorded, where the start is free.
     """
     steps = data.frame_count - 1
     length = -(-steps // segment_count)
@@ -110,7 +147,7 @@ def cut(model: Model, state: State, data: Trajectories, segment_count: int, star
         if start != "free":
             part[:, 0, 0] = np.nan
         observed[name] = part
-    motions = guesses(model, state, data, [min(begin, steps) for begin in begins], start == "recorded")
+    motions, told = guesses(model, state, data, [min(begin, steps) for begin in begins], start == "recorded")
     if start == "model":
         for leaf, given in zip(motions, motion_of(state), strict=True):
             leaf[:, 0] = np.asarray(given)
@@ -119,7 +156,14 @@ def cut(model: Model, state: State, data: Trajectories, segment_count: int, star
     if data.action is not None:
         padded = np.concatenate([data.action, np.zeros((data.count, 1, motors))], 1)
         action = padded[:, np.minimum(frames[:, :-1], steps)]
-    return Segments(motions, observed, action, frames)
+    pull = np.zeros((data.count, segment_count, len(model.scene.dynamic_bodies), len(motions), 3))
+    if start == "free":
+        widths = np.array([getattr(spread, leaf) for leaf in Motion._fields])
+        jointed = {body for joint in model.scene.joints for body in (joint.parent, joint.child)}
+        loose = [body not in jointed for body in model.scene.dynamic_bodies]
+        unknown = ~told[:, 0, list(model.scene.dynamic_bodies)] & np.array(loose, bool)[:, None]
+        pull[:, 0] = np.where(unknown, 1.0 / widths, 0.0)[..., None]
+    return Segments(motions, observed, action, pull.reshape(data.count, segment_count, -1), frames)
 
 
 class Objective:
@@ -132,7 +176,7 @@ class Objective:
         noise: divides the residuals.
         segment_count: of multiple shooting; 1 for single shooting.
         substeps: steps of the engine between two frames.
-        start: see `cut`.
+        start, spread: see `cut`.
     """
 
     def __init__(
@@ -145,13 +189,14 @@ class Objective:
         segment_count: int,
         substeps: int,
         start: str,
+        spread: Spread,
     ) -> None:
         self.model = dataclasses.replace(model, dt=jnp.asarray(data.dt / substeps, model.dt.dtype))
         self.state, self.vector, self.noise, self.substeps = state, vector, noise, substeps
         self.recorded = tuple(model.scene.body_names.index(body) for body in data.bodies)
         self.moving = model.scene.dynamic_bodies
         self.used = [name for name in CHANNELS if name in data.channels and getattr(noise, name) is not None]
-        self.start, self.segment_count = start, segment_count
+        self.start, self.spread, self.segment_count = start, spread, segment_count
         self.chart_size = CHART * len(self.moving)
         self._residuals = jax.jit(jax.vmap(self._residuals_of_all, (0, 0, None, None, None)))
         self._linearise = jax.jit(jax.vmap(self._linearise_all, (0, 0, None, None, None)))
@@ -159,10 +204,14 @@ class Objective:
 
     def _take_data(self, data: Trajectories) -> None:
         self.data = data
-        self.segments = cut(self.model, self.state, data, self.segment_count, self.start)
+        self.segments = cut(self.model, self.state, data, self.segment_count, self.start, self.spread)
         self._arrays = jax.tree.map(
             lambda x: jnp.asarray(x, self.state.position.dtype),
-            (self.segments.start, {name: self.segments.observed[name] for name in self.used}, self.segments.action),
+            (
+                self.segments.start,
+                {name: self.segments.observed[name] for name in self.used} | {PULL: self.segments.pull},
+                self.segments.action,
+            ),
         )
 
     def with_data(self, data: Trajectories) -> Objective:
@@ -173,8 +222,9 @@ class Objective:
 
     @property
     def mask(self) -> np.ndarray:
-        """(trajectory, segment, residual) whether something was recorded."""
+        """(trajectory, segment, residual) whether something was recorded, or is pulled towards the scene."""
         parts = [self._flat(~np.isnan(self.segments.observed[name]), name) for name in self.used]
+        parts.append(self.segments.pull > 0)
         return np.concatenate(parts, -1)
 
     @property
@@ -184,6 +234,7 @@ class Objective:
         for name in self.used:
             count = len(self.recorded) * _width(name)
             parts.append(np.repeat(self.segments.frames, count, axis=1))
+        parts.append(np.repeat(self.segments.frames[:, :1], self.chart_size, axis=1))
         return np.concatenate(parts, -1)
 
     def _flat(self, value: np.ndarray, name: str) -> np.ndarray:
@@ -204,6 +255,16 @@ class Objective:
             joined = [part[:, 0, :1], *(part[:, k, 1:] for k in range(shape[0]))]
             found[name] = np.concatenate(joined, 1)[:, : self.data.frame_count]
         return found
+
+    def pulled(self, charts: np.ndarray) -> dict[tuple[str, str], float]:
+        """How far beginnings (n, s, chart) lie off the scene in what was not recorded: (body, leaf) -> largest [spread]."""
+        away = np.abs(self.segments.pull[:, 0] * charts[:, 0]).reshape(len(charts), len(self.moving), -1, 3).max((0, 3))
+        names = self.model.scene.body_names
+        return {
+            (names[body], leaf): float(away[place, number])
+            for place, body in enumerate(self.moving)
+            for number, leaf in enumerate(Motion._fields)
+        }
 
     @property
     def start_arrays(self) -> Motion:
@@ -248,6 +309,7 @@ class Objective:
             else:
                 error = simulated - seen
             parts.append(jnp.ravel(jnp.where(known, error, 0.0)) / getattr(self.noise, name))
+        parts.append(observed[PULL] * chart)
         return jnp.concatenate(parts), final
 
     def residuals(self, unbounded: Any, charts: Any) -> tuple[Array, Array]:

@@ -221,7 +221,9 @@ def _transform(parameter: Parameter, quantity: Quantity, start: np.ndarray) -> t
             f"fit: bounds of '{label}' must be increasing and between {quantity.lower:g} and {quantity.upper:g}, "
             f"got {lower:g} and {upper:g}"
         )
-    if not np.all(np.isfinite(start)) or not np.all((start > lower) & (start < upper)):
+    # A bound at the value of the scene is missed by the round-off of that: so close to it nothing moves.
+    off = 1e-6 * np.abs(start)
+    if not np.all(np.isfinite(start)) or not np.all((start - off > lower) & (start + off < upper)):
         raise ValueError(
             f"fit: the start of '{label}' must lie strictly between its bounds {lower:g} and {upper:g}, got "
             f"{start.tolist()}; give another start or wider bounds"

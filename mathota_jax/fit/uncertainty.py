@@ -19,8 +19,9 @@ CORRELATED = 0.95
 VAGUE = 0.5
 """Half width of an interval over the estimate above which a parameter is said to be poorly determined."""
 
-MISFIT = 2.0
-"""Residuals over the noise given above which the model is said not to explain the data."""
+MISFIT, CHANCE = 1.2, 1e-4
+"""The model is said not to explain the data where the residuals are this many times the noise given, and of right models
+fewer than this share would have such residuals."""
 
 
 class Uncertainty(NamedTuple):
@@ -64,7 +65,7 @@ def uncertainty(
         unbounded: (entry,) estimate.
         equations: there.
         square_sum: of the residuals there.
-        residual_count: number of residuals.
+        residual_count: number of residuals, what pulls beginnings towards the scene included.
         start_unknowns: number of free numbers of all beginnings.
         confidence: share such as 0.95.
     """
@@ -98,7 +99,7 @@ def uncertainty(
                     f"{correlation[k, other]:.3f}."
                 )
     warnings += _at_bounds(vector, unbounded)
-    if factor > MISFIT:
+    if freedom > 0 and factor > max(MISFIT, float(np.sqrt(stats.chi2.isf(CHANCE, freedom) / freedom))):
         warnings.append(
             f"The residuals are {factor:.3g} times the noise given: the model does not explain the data, or the noise is "
             "larger. The intervals grow with the residuals but take them for independent, so that they are too narrow "

@@ -9,7 +9,7 @@ import math
 import jax
 import numpy as np
 
-from mathota_jax import Plane, SceneBuilder, Sphere, rollout
+from mathota_jax import Box, Plane, SceneBuilder, Sphere, rollout
 from mathota_jax.fit import Noise, Parameter, Trajectories
 from mathota_jax.fit.arrays import turned
 from tests.scenes import undamped
@@ -50,6 +50,28 @@ def struck_ball():
     )
     builder.add_body(Sphere(0.1), mass=1.0, friction=0.4, restitution=0.9, name="striker")
     return builder.build(undamped(dt=FRAME / SUBSTEPS))
+
+
+def puck(friction):
+    """A flat box on a table."""
+    builder = SceneBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    builder.add_body(Plane((0, 0, 1)), static=True, friction=friction, name="table")
+    builder.add_body(Box((0.04, 0.04, 0.01)), mass=0.1, position=(0, 0, 0.01), friction=friction, name="puck")
+    return builder.build(undamped())
+
+
+def slides(friction, seed):
+    """Positions (trajectory, frame, 1, 3) of three sliding pucks in closed form, 1 mm of noise, a tenth of them missing."""
+    generator = np.random.default_rng(seed)
+    times, motions = np.arange(50) / 50, []
+    for speed, heading in ((1.0, 0.3), (0.6, 2.0), (1.4, -1.0)):
+        sliding = np.minimum(times, speed / (friction * GRAVITY))
+        way = speed * sliding - friction * GRAVITY * sliding**2 / 2
+        motions.append(np.stack([way * math.cos(heading), way * math.sin(heading), np.full(50, 0.01)], -1))
+    position = np.asarray(motions)[:, :, None]
+    position = position + generator.normal(0, 1e-3, position.shape)
+    position[generator.random(position.shape[:2]) < 0.1] = np.nan
+    return Trajectories("puck", 1 / 50, position)
 
 
 def unknown(factor=1.3):

@@ -1,12 +1,13 @@
 """Recorded motions: what is refused, and that files come back as they were written."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
 from mathota_jax import Plane, SceneBuilder, Sphere
-from mathota_jax.fit import Noise, Trajectories, fit, load, load_csv, load_npz, save_npz
+from mathota_jax.fit import Noise, Parameter, Spread, Trajectories, fit, load, load_csv, load_npz, save_npz
 
 NAN = float("nan")
 
@@ -95,6 +96,13 @@ def ball_data(**changes):
         (ball_data(), {"substeps": 0}, "substeps must be a whole number"),
         (ball_data(), {"huber": -1.0}, "huber must be a positive number"),
         (ball_data(), {"confidence": 95}, "confidence must lie between 0 and 1"),
+        (ball_data(), {"horizons": 1.0}, "horizons must be positive and increasing"),
+        (ball_data(), {"horizons": ("a", 1.0)}, "horizons must be numbers"),
+        (ball_data(), {"huber": "a"}, "huber must be a positive number"),
+        (ball_data(), {"noise": 1e-3}, "noise must be a Noise, such as"),
+        (ball_data(), {"spread": 1e-3}, "spread must be a Spread, such as"),
+        (ball_data(), {"optimiser": "adam"}, "optimiser must be one of optax"),
+        (ball_data(), {"parameters": [Parameter("gravity", lower=9.81, upper=12)]}, "start of 'gravity'"),
         (np.zeros((1, 5, 1, 3)), {}, "data must be Trajectories"),
     ],
 )
@@ -103,7 +111,16 @@ def test_mistakes_of_a_fit_are_named(data, settings, message):
         fit(*ball_scene(), **{"parameters": ["gravity"], "data": data, **settings})
 
 
+def test_model_and_state_the_wrong_way_round():
+    model, state = ball_scene()
+    with pytest.raises(ValueError, match="give model, state as `build` returns them, got State, Model"):
+        fit(state, model, ["gravity"], ball_data())
+
+
 def test_noise_must_be_positive():
+    assert Noise(position=np.float32(2e-3)).position == pytest.approx(2e-3)
+    with pytest.raises(ValueError, match=r"Spread\.orientation must be a positive"):
+        Spread(orientation=math.inf)
     with pytest.raises(ValueError, match=r"Noise\.position must be a positive"):
         Noise(position=0.0)
     with pytest.raises(ValueError, match=r"Noise\.orientation"):
@@ -157,6 +174,8 @@ def test_csv(tmp_path):
         ("7.01,", ",", "line 6: the time is missing"),
         ("b,7.01,ball,5,2,0,1,0,0,0\n", "", "trajectory 1 holds nothing after its first frame"),
         ("5,2,0,1,0,0,0", "5,2,0", "line 6: expected 10 cells"),
+        ("7.01,ball", "7.01,", "line 6: the name of the body is missing"),
+        ("7.01,ball", "7.00000001,ball", "frames for 5 lines; times that are meant to be one must be equal"),
         (CSV.partition("\n")[2], "", "no line below the header"),
     ],
 )
@@ -173,6 +192,10 @@ def test_bad_files(tmp_path):
         load(tmp_path / "missing.npz")
     with pytest.raises(ValueError, match=r"not from .\.txt."):
         load(tmp_path / "motion.txt")
+    path = tmp_path / "motion.csv"
+    path.write_bytes("time,body,x,y,z\n0,Würfel,0,0,0\n".encode("latin-1"))
+    with pytest.raises(ValueError, match=r"motion\.csv: not a text file in UTF-8"):
+        load(path)
     path = tmp_path / "motion.npz"
     path.write_bytes(b"no archive")
     with pytest.raises(ValueError, match="not an NPZ file"):
