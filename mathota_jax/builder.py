@@ -300,7 +300,9 @@ class SceneBuilder:
             )
             if scene.options.sleep
             else None,
-            end_forces=EndForces(contact_force, joint_force) if scene.options.solver == "soft_step" else None,
+            end_forces=EndForces(jnp.copy(contact_force), jnp.copy(joint_force))
+            if scene.options.solver == "soft_step"
+            else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:

@@ -1,10 +1,13 @@
-"""Whether the leaves of a model and a state fit its scene: clear errors where a user has replaced some."""
+"""Whether the leaves of a model and a state fit its scene, where a user has replaced some: clear errors, values in range."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -46,10 +49,12 @@ STATE: dict[str, tuple] = {
     "applied_torque": (BODY, 3),
 }
 """Shapes by the counts of the scene; a leaf that is None is absent."""
+LENGTHS = ("radius", "half_extents", "half_height")
+"""Parameters of shapes that are positive."""
 
 
 def check_leaves(label: str, model: Model, state: State) -> None:
-    """Checks kinds, shapes and types; shapes of geometry and what the solver remembers are left to those who read them.
+    """Checks kinds, shapes and types; what the solver remembers is left to those who read it.
 
     Raises:
       ValueError: one of them does not fit, or model and state are not what they should be.
@@ -60,11 +65,33 @@ def check_leaves(label: str, model: Model, state: State) -> None:
     for owner, value, shapes in (("state", state, STATE), ("model", model, MODEL)):
         for name, shape in shapes.items():
             _check(label, f"{owner}.{name}", getattr(value, name), shape, model.scene)
+    kinds = [entry.kind for entry in model.scene.shapes]
+    for kind, parameters in model.shapes.items():
+        for name, leaf in parameters.items():
+            if np.shape(leaf)[:1] != (kinds.count(kind),):
+                raise ValueError(
+                    f"{label}: model.shapes['{kind}']['{name}'] must have an entry for each {kind} of the scene, "
+                    f"{kinds.count(kind)}, got shape {np.shape(leaf)}"
+                )
+
+
+def values_in_range(model: Model) -> Array:
+    """(world,) whether frictions, restitutions and shapes of a worlds-last model are such as bodies have."""
+    fine = [jnp.isfinite(leaf) for parameters in model.shapes.values() for leaf in parameters.values()]
+    fine += [parameters[name] > 0 for parameters in model.shapes.values() for name in LENGTHS if name in parameters]
+    if model.scene.friction:
+        fine.append(model.friction >= 0)
+    if model.scene.restitution:
+        fine.append((model.restitution >= 0) & (model.restitution <= 1))
+    each = [jnp.all(values.reshape(-1, values.shape[-1]), axis=0) for values in fine]
+    return functools.reduce(jnp.logical_and, each, jnp.ones(1, bool))
 
 
 def _check(label: str, name: str, leaf: Any, symbolic: tuple, scene: Scene) -> None:
     if leaf is None:
         return
+    if isinstance(leaf, list | tuple):
+        raise ValueError(f"{label}: {name} must be an array, got a {type(leaf).__name__}")
     counts = {BODY: scene.body_count, JOINT: len(scene.joints), MOTOR: len(scene.motors)}
     shape = tuple(counts.get(length, length) for length in symbolic)
     if np.shape(leaf) != shape:

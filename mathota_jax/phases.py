@@ -38,8 +38,9 @@ from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import in_every_world, take
-from mathota_jax.spatial.settle import compute_once, store_cotangents
-from mathota_jax.spatial.vector import Vec3
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import compute_once, settle, store_cotangents
+from mathota_jax.spatial.vector import Vec3, dot, where
 from mathota_jax.state import State
 
 
@@ -268,14 +269,34 @@ def close_joints(
     return lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
 
 
-def stop_at_impacts(model: Model, bodies: Bodies, moved: Bodies, displacement: tuple[Vec3, Vec3]) -> Bodies:
+def stop_at_impacts(
+    model: Model, bodies: Bodies, inertia: Inertia, moved: Bodies, displacement: tuple[Vec3, Vec3]
+) -> Bodies:
     """Fast bodies stop at the first touch on their way (guide 10.4), mechanisms as a whole."""
     scene = model.scene
     motion = events.Motion(bodies.position, bodies.orientation, *(of_all_bodies(scene, part) for part in displacement))
     trees = ()
     if (found := layout(scene)) is not None:
         trees = tuple(tuple(scene.dynamic_bodies[found.blocks[link]] for link in tree) for tree in found.trees)
-    return moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved), trees))
+    stopped = moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved), trees))
+    return stopped if inertia.rotation is None else _keep_spin(inertia, moved, stopped)
+
+
+def _keep_spin(inertia: Inertia, moved: Bodies, stopped: Bodies) -> Bodies:
+    """Angular velocities that go with the orientation in which a body stopped: of its angular momentum, or less.
+
+    At the end of the step the momentum may have been about an axis of a larger moment: the same about that of a smaller one
+    would be more energy.
+    """
+    momentum = inertia.at(moved.orientation).apply(moved.angular_velocity)
+    spin = inertia.at(stopped.orientation).solve(momentum)
+    before, after = dot(moved.angular_velocity, momentum), dot(spin, momentum)
+    gains = settle(jnp.where(after > before, 1.0, 0.0)) > 0.5
+    scale = safe_sqrt(jnp.where(gains, safe_divide(before, after), 1.0))
+    turned = functools.reduce(
+        jnp.logical_or, (a != b for a, b in zip(moved.orientation, stopped.orientation, strict=True))
+    )
+    return stopped._replace(angular_velocity=where(turned, spin * scale, moved.angular_velocity))
 
 
 def let_sleep(model: Model, old: State, new: State, action: Array, problem: Problem) -> State:

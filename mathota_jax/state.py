@@ -37,6 +37,10 @@ class Flag(enum.IntFlag):
     """A joint of a closed loop was open by a tenth of the arms of its bodies, or by 0.1 rad, at the start of a step: the
     joints contradict each other, the solver can not close them (more sweeps, smaller steps), or the state was given so."""
 
+    INVALID_PARAMETER = 64
+    """A leaf of the model is not finite or out of range: a negative friction, a restitution beyond 0 to 1, a length of a
+    shape that is not positive. (A mass or a moment of inertia that is not positive makes the motion NaN.)"""
+
 
 @pytree
 class Sleep:

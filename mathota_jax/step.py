@@ -20,7 +20,7 @@ from mathota_jax.constraints.problem import Forces, constrain, known_impulses, s
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
-from mathota_jax.leaf_shapes import check_leaves
+from mathota_jax.leaf_shapes import check_leaves, values_in_range
 from mathota_jax.model import Model
 from mathota_jax.outcome import end_forces, forces, new_state
 from mathota_jax.phases import (
@@ -145,6 +145,7 @@ def _solve_step(
     new, mechanisms = _simulate_or_rest(passing, state, action, solved)
     new = jax.tree.map(lambda before, after: jnp.where(runs, after, before), state, new)
     bad = jnp.where(runs | (model.dt == 0), 0, int(Flag.INVALID_TIME_STEP))
+    bad = bad | jnp.where(values_in_range(model), 0, int(Flag.INVALID_PARAMETER))
     return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype)), jax.lax.stop_gradient(mechanisms)
 
 
@@ -203,7 +204,7 @@ def _simulate(
     if not small:
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
-        moved = stop_at_impacts(model, bodies, moved, displacement)
+        moved = stop_at_impacts(model, bodies, inertia, moved, displacement)
     if problem.held is not None:
         moved, closed = close_joints(model, bodies, moved, closed)
     new = new_state(scene, state, moved, forces(model, problem, impulses), failed)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import (
+    BallAndSocket,
     Box,
     Capsule,
     Cone,
@@ -19,10 +20,21 @@ from mathota_jax import (
     Sphere,
     step,
 )
-from tests.scenes import advance, body_on_plane, motion, record_worlds, repeat, rotation_matrix, slab_on_plane, undamped
+from tests.scenes import (
+    advance,
+    body_on_plane,
+    invariants,
+    motion,
+    record_worlds,
+    repeat,
+    rotation_matrix,
+    slab_on_plane,
+    undamped,
+)
 
 DT = 1 / 60
 RUNS = 1000
+MOTION = ("position", "orientation", "velocity", "angular_velocity")
 SHAPES = {
     "sphere": Sphere(0.1),
     "capsule": Capsule(0.1, 0.2),
@@ -232,3 +244,54 @@ def test_a_fast_turn_keeps_its_energy(float64, dt, gate):
                       np.asarray(record["angular_velocity"])[:, 0, 1])  # fmt: skip
     energy = np.sum(inertia * local**2, axis=-1)
     gate("energy / start - 1", energy / np.sum(inertia * spin**2) - 1, 0.02 if dt < 0.05 else 0.3)
+
+
+@pytest.mark.parametrize(("friction", "restitution"), [(0.3, 0.5), (0.3, 0.0), (0.0, 0.0), (0.0, 0.5)], ids=str)
+def test_a_spinning_plank_gains_no_energy(float64, gate, friction, restitution):
+    """A plank that turns by a radian and more in a step is stopped in the orientation in which it meets the wall."""
+    model, state = flying(Box((0.2, 0.02, 0.1)), Box((0.005, 3, 3)), True, {"friction": 0.3, "restitution": 0.5})
+    model = dataclasses.replace(
+        model,
+        friction=jnp.full_like(model.friction, friction),
+        restitution=jnp.full_like(model.restitution, restitution),
+    )
+    rng, count = np.random.default_rng(0), 96
+    speed = np.stack([rng.uniform(5, 60, count), *rng.uniform(-5, 5, (2, count))], axis=-1)
+    turn = rng.normal(size=(count, 4))
+    states = repeat(state, count)
+    states = dataclasses.replace(
+        states,
+        position=states.position.at[:, 1].set(jnp.array([-0.6, 0, 0])),
+        orientation=states.orientation.at[:, 1].set(turn / np.linalg.norm(turn, axis=-1, keepdims=True)),
+        velocity=states.velocity.at[:, 1].set(speed),
+        angular_velocity=states.angular_velocity.at[:, 1].set(40.0 * rng.normal(size=(count, 3))),
+    )
+    _, record = record_worlds(repeat(model, count), states, 60, motion)
+    properties = {"mass": model.mass[1:], "inertia": model.inertia[1:]}
+
+    def energy(place):
+        """Kinetic energy of a motion (..., body, component)."""
+        return invariants(properties, *(np.asarray(place[name])[..., 1:, :] for name in MOTION))[0]
+
+    first = energy({name: getattr(states, name) for name in MOTION})
+    gate("energy / that at first - 1", np.maximum(energy(record) / first - 1, 0.0), 1e-3)
+    gate("beyond the wall [m]", np.maximum(record["position"][:, :, 1, 0], 0.0), 0.0)
+
+
+def test_a_jointed_pair_that_hits_a_wall(float64, gate):
+    """A box and a capsule on a ball joint: neither is the energy of the flight exceeded, nor does the joint open."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    surface = {"friction": 0.3, "restitution": 0.5}
+    builder.add_body(Box((0.005, 3, 3)), static=True, **surface)
+    box = builder.add_body(Box((0.1, 0.02, 0.05)), mass=1.0, position=(-0.6, 0, 0), **surface)
+    rod = builder.add_body(Capsule(0.02, 0.1), mass=0.5, position=(-0.6, 0.14, 0), **surface)
+    builder.add_joint(BallAndSocket(box, rod, (-0.6, 0.02, 0)))
+    model, state = builder.build(undamped(dt=DT))
+    rng, count = np.random.default_rng(0), 48
+    speed = np.stack([rng.uniform(5, 60, count), *rng.uniform(-5, 5, (2, count))], axis=-1)
+    states = repeat(state, count)
+    states = dataclasses.replace(states, velocity=states.velocity.at[:, 1:].set(speed[:, None]))
+    _, record = record_worlds(repeat(model, count), states, 60, lambda m, s: {**motion(m, s), "flags": s.flags})
+    properties = {"mass": model.mass[1:], "inertia": model.inertia[1:]}
+    energy = invariants(properties, *(np.asarray(record[name])[..., 1:, :] for name in MOTION))[0]
+    gate("energy / that at first - 1", energy / (0.75 * np.sum(speed**2, -1)) - 1, 0.01)

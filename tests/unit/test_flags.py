@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mathota_jax import Flag, step
 from tests.scenes import advance_worlds, box_stack, repeat, sphere_on_plane
 
 WORLDS, BAD = 5, 2
@@ -66,3 +67,31 @@ def test_flag_stays_until_the_user_clears_it():
     assert int(advance_worlds(models, mended, 3).flags[BAD]) != 0
     cleared = dataclasses.replace(states, flags=jnp.zeros_like(flagged.flags))
     assert not np.any(np.asarray(advance_worlds(models, cleared, 3).flags))
+
+
+@pytest.mark.parametrize(
+    ("leaf", "value"), [("friction", -0.1), ("friction", jnp.nan), ("restitution", 1.5), ("restitution", jnp.nan)]
+)
+def test_surfaces_that_no_body_has_are_flagged(leaf, value):
+    models, states = batch(lambda: sphere_on_plane(height=0.2, restitution=0.7, friction=0.5))
+    wrong = dataclasses.replace(models, **{leaf: getattr(models, leaf).at[BAD, 1].set(value)})
+    flags = np.asarray(advance_worlds(wrong, states, 1).flags)
+    np.testing.assert_array_equal(flags, np.where(np.arange(WORLDS) == BAD, int(Flag.INVALID_PARAMETER), 0))
+
+
+@pytest.mark.parametrize("value", [-0.1, 0.0, jnp.nan])
+def test_sizes_that_no_shape_has_are_flagged(value):
+    models, states = batch(SCENES["boxes"])
+    half = models.shapes["box"]["half_extents"].at[BAD, 0, 1].set(value)
+    wrong = dataclasses.replace(models, shapes=models.shapes | {"box": {"half_extents": half}})
+    flags = np.asarray(advance_worlds(wrong, states, 1).flags)
+    np.testing.assert_array_equal(flags & int(Flag.INVALID_PARAMETER) != 0, np.arange(WORLDS) == BAD)
+
+
+def test_leaves_that_do_not_fit_are_named():
+    model, state = box_stack(3)
+    half = jnp.full((4, 3), 0.1)
+    with pytest.raises(ValueError, match=r"model\.shapes\['box'\]\['half_extents'\] must have an entry for each box"):
+        step(dataclasses.replace(model, shapes=model.shapes | {"box": {"half_extents": half}}), state)
+    with pytest.raises(ValueError, match=r"model\.mass must be an array, got a list"):
+        step(dataclasses.replace(model, mass=[1.0] * 4), state)

@@ -27,6 +27,14 @@ def free_box(**body):
     return builder.build(undamped(dt=0.01))
 
 
+@pytest.mark.parametrize("solver", ["pgs", "soft_step", "converged"])
+def test_no_two_leaves_share_a_buffer(solver):
+    """Or the first state could not be donated (`jax.jit(step, donate_argnums=1)`)."""
+    _, state = slab_on_plane(options=undamped(solver=solver, sleep=True))
+    leaves = [leaf for leaf in jax.tree.leaves(state) if leaf.size]
+    assert len({leaf.unsafe_buffer_pointer() for leaf in leaves}) == len(leaves)
+
+
 def test_shapes_and_types(precision):
     model, state = slab_on_plane()
     shapes = {"position": (2, 3), "orientation": (2, 4), "velocity": (2, 3), "angular_velocity": (2, 3), "flags": ()}
