@@ -156,7 +156,7 @@ def starting_impulses(
         return _impulses(model, problem, last.joint_force, None), None
     force = matched_force(model.scene, problem.contacts, problem.close, state, last.contact_force)
     start = _impulses(model, problem, last.joint_force, force)
-    if len(model.scene.dynamic_bodies) > 1 and model.scene.options.solver != "soft_step":
+    if model.scene.options.solver != "soft_step":
         return warm_start.plausible(problem.rows, inertia, velocity, start)
     return start, None
 

@@ -8,9 +8,10 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere
-from tests.scenes import DOWN, advance, axis_angle, motion, record_worlds, repeat, with_dt
+from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, step
+from tests.scenes import DOWN, advance, axis_angle, motion, record_worlds, repeat, undamped, with_dt
 
 
 def pile(order=(0, 1, 2)):
@@ -38,6 +39,20 @@ def test_removing_the_heavy_ball_does_not_lift_the_light_ones(precision, gate):
     rise = np.asarray(record["position"])[:, 0, 1:3, 1] - np.asarray(loaded.position)[1:3, 1]
     gate("upward movement [m]", np.maximum(0.0, rise), 1e-3)
     gate("upward speed [m/s]", np.maximum(0.0, record["velocity"][:, 0, 1:3, 1]), 1e-2)
+
+
+@pytest.mark.parametrize("small", [1e-4, 1e-7, 1e-12])
+def test_a_tiny_step_in_which_a_box_lands(precision, gate, small):
+    """The mean force of the impact, times the next step, is no impulse to start from: the box loses what it fell with."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True)
+    builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(0.0, 0.1, 0.0), velocity=(0.3, -1.0, 0.0))
+    model, state = builder.build(undamped(dt=0.01))
+    landed = step(dataclasses.replace(model, dt=jnp.asarray(small, model.dt.dtype)), state)
+    _, record = record_worlds(repeat(model, 1), repeat(landed, 1), 5, motion)
+    gate("upward speed [m/s]", np.maximum(0.0, record["velocity"][:, 0, 1, 1]), 1e-2)
+    gate("height - 0.1 [m]", record["position"][:, 0, 1, 1] - 0.1, 1e-4)
+    gate("spin [rad/s]", record["angular_velocity"][:, 0, 1], 1.0)
 
 
 def test_changing_the_time_step_does_not_kick(precision, gate):
