@@ -115,11 +115,12 @@ def _step(
     observation = jnp.where(finite, raw_observation, 0.0)
     non_finite = ((state.flags & Flag.NON_FINITE) != 0) | ~finite.all()
     reward, terminated, info = environment.judge(observation, action)
+    finite_info = {name: jnp.where(non_finite, jnp.zeros_like(value), value) for name, value in info.items()}
     return (
         env_state,
         observation,
         jnp.where(non_finite, 0.0, reward),
         terminated | non_finite,
         environment.is_truncated(env_state.step_count),
-        {**info, "non_finite": non_finite},
+        {**finite_info, "non_finite": non_finite},
     )

@@ -139,6 +139,7 @@ def test_a_non_finite_world_terminates_and_leaves_the_others_bitwise_alone(id):
         broken, transition = step_worlds(environment, broken, actions.at[1].set(jnp.nan) if time == 0 else actions)
         np.testing.assert_array_equal(transition.terminated, [False, True, False])
         np.testing.assert_array_equal(transition.info["non_finite"], [False, True, False])
+        assert all(not value[1].any() for name, value in transition.info.items() if name != "non_finite")
         assert transition.reward[1] == 0.0
         assert np.isfinite(transition.observation).all()
         for name in ("observation", "reward", "truncated"):
