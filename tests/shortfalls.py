@@ -31,6 +31,18 @@ SHORTFALLS: dict[str, str] = {
     "(energy never gained), one rod alone holds with 10",
     "tests/physics/test_mechanism_steps.py::test_a_fast_chain_does_not_pass_a_wall[180.0]": "four jointed balls of 0.1 m "
     "that fly at 180 m/s against a wall: the centre of one gets 7.4 mm into it, gate 0; none passes, none does at 30 m/s",
+    "tests/physics/test_fast_bodies.py::test_a_spinning_plank_gains_no_energy[0.0-0.5]": "planks that turn by a radian and "
+    "more in a step and bounce without friction: 8 of 96 gain more than 1 %, one thrice its energy, gate 0.1 %; none with "
+    "friction or without restitution, 2 (21 %) where they do not stop at the wall",
+    "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall": "two bodies of 0.1 m on one ball joint that "
+    "hit a wall at more than 10 m/s, in steps of 1/60 s in which they turn by several radians: 2 of 48 open and gain energy "
+    "without bound (1e83), 5 with `continuous`; 50 sweeps do not help, no position correction or steps of 1/240 s do",
+    **{
+        f"tests/physics/test_impact_events.py::test_a_ball_dropped_by_little_gains_no_energy[{dt}-{restitution}]": "a ball "
+        "that would bounce more often in a step than it is split at, from less than a millimetre, is lifted: a step gains "
+        f"{gain} times the first energy, gate 1e-3; none with restitutions of 0 and 1"
+        for dt, restitution, gain in ((0.5, 0.5, 24), (1 / 30, 0.8, 2.6))
+    },
     "tests/gradients/test_slide_gradient.py::test_a_spinning_box_that_just_touches": "the derivative by the mass is 7 % too "
     "large, that by the height and the position without bound: of four corners at the height 0 to round-off some carry "
     "none of the load, and their shares are undetermined; right for one step, and where the box is pressed in by 5 um",

@@ -13,7 +13,11 @@ from tests.scenes import (
     advance,
     axis_angle,
     body_on_plane,
+    motion,
+    record_worlds,
+    repeat,
     rotation_matrix,
+    sphere_on_plane,
     undamped,
     with_dt,
 )
@@ -159,3 +163,16 @@ def test_without_restitution_the_option_changes_nothing(float64):
     assert (split.position == ordinary.position).all()
     zero_gap = dataclasses.replace(state, position=jnp.asarray(state.position).at[1, 1].set(0.1))
     assert (advance(model, zero_gap, 3).position == advance(plain, zero_gap, 3).position).all()
+
+
+@pytest.mark.parametrize(("dt", "restitution"), [(0.5, 0.5), (1 / 30, 0.8)])
+def test_a_ball_dropped_by_little_gains_no_energy(float64, gate, dt, restitution):
+    """Drops of micrometres to decimetres, with more bounces in a step than it is split at."""
+    model, state = sphere_on_plane(restitution=restitution, options=undamped(impact_events=1))
+    heights = np.geomspace(1e-6, 0.3, 40)
+    states = repeat(state, len(heights))
+    states = dataclasses.replace(states, position=states.position.at[:, 1, 1].set(0.1 + heights))
+    _, record = record_worlds(with_dt(repeat(model, len(heights)), dt), states, 6, motion)
+    energy = GRAVITY * (record["position"][:, :, 1, 1] - 0.1) + record["velocity"][:, :, 1, 1] ** 2 / 2
+    energy = np.concatenate([GRAVITY * heights[None], energy])
+    gate("gain of energy in a step, share of the first", np.maximum(np.diff(energy, axis=0), 0) / energy[0], 1e-3)
