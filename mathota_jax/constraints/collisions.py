@@ -52,7 +52,7 @@ class Foreseen(NamedTuple):
     Attributes:
       apart: what a step that is split leaves to the search, since it meets at speed or is apart.
       clear: what no contact row should touch: it parts at speed and does not meet again, or flies past.
-      returns: what touches, leaves at speed and meets again.
+      returns: what touches, leaves and meets again.
       target, lever: for those that return, the velocity to reach in the end [m/s] and the lever of the impulse [s].
     """
 
@@ -117,17 +117,17 @@ def foreseen(
 def _return(
     model: Model, group: ContactRows, now: Array, then: Array, left: Array, fast: Array
 ) -> tuple[Array, Array, Array]:
-    """Which contacts touch, leave at speed and come back, the velocity to reach, and the lever of the impulse.
+    """Which contacts touch, leave and come back, the velocity to reach, and the lever of the impulse.
 
-    They rebound once more if they are in flight at the end. Else they end where they touched: their own impacts are over by
-    then, or too many to follow.
+    They rebound once more if they come back at speed and are in flight at the end. Else they end where they touched:
+    their own impacts are over by then, or too many to follow.
     """
     start, free = (first_row_velocity(group.rows, v) for v in (now, then))
     acceleration = (free - start) / left
-    comes_back = fast & (group.separation <= 0) & (start > 0) & (start + free < 0)
+    comes_back = (group.separation <= 0) & (start > 0) & (start + free < 0)
     time = jnp.where(comes_back, -2.0 * start / jnp.where(comes_back, acceleration, 1.0), 0.0)
     velocity = _restitution(model, group.rows, now.shape[-1]) * start + acceleration * (left - time)
-    rebounds = comes_back & (velocity > 0)
+    rebounds = comes_back & fast & (velocity > 0)
     lever = jnp.where(rebounds, left - time, 0.5 * left * (1.0 + start / jnp.where(comes_back, free, -1.0)))
     chosen = settle(jnp.where(comes_back, 1.0, 0.0) + jnp.where(rebounds, 1.0, 0.0))
     return chosen > 0.5, jnp.where(chosen > 1.5, velocity, 0.0), lever

@@ -165,7 +165,7 @@ def test_without_restitution_the_option_changes_nothing(float64):
     assert (advance(model, zero_gap, 3).position == advance(plain, zero_gap, 3).position).all()
 
 
-@pytest.mark.parametrize(("dt", "restitution"), [(0.5, 0.5), (1 / 30, 0.8)])
+@pytest.mark.parametrize(("dt", "restitution"), [(0.5, 0.5), (1 / 30, 0.8), (1 / 60, 0.8)])
 def test_a_ball_dropped_by_little_gains_no_energy(float64, gate, dt, restitution):
     """Drops of micrometres to decimetres, with more bounces in a step than it is split at."""
     model, state = sphere_on_plane(restitution=restitution, options=undamped(impact_events=1))
