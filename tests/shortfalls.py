@@ -36,7 +36,7 @@ SHORTFALLS: dict[str, str] = {
     "friction or without restitution, 2 (21 %) where they do not stop at the wall",
     "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall": "two bodies of 0.1 m on one ball joint that "
     "hit a wall at more than 10 m/s, in steps of 1/60 s in which they turn by several radians: 2 of 48 open and gain energy "
-    "without bound (1e83), 5 with `continuous`; 50 sweeps do not help; without position correction, or in steps of 1/240 s, none does",
+    "without bound (1e83), 5 with `continuous` and 2 with 50 sweeps; none without position correction or steps of 1/240 s",
     "tests/physics/test_impact_events.py::test_a_ball_dropped_by_little_gains_no_energy[0.016666666666666666-0.8]": "of 40 "
     "balls that fall by less than a millimetre 2 end a step up to 0.6 mm in the plane and are pushed out: 0.03 of "
     "the first energy in a step, gate 1e-3; none in longer steps",
