@@ -42,6 +42,7 @@ class JointMotion(NamedTuple):
       middle: rows at the middle of the step, whose Jacobians are used.
       coefficients: of the laws.
       inertia: of the moving bodies.
+      turning: (slot, world) what the turning of the Jacobians adds to the rates until then; None where others follow it.
       responses: to the rows with bounds of mechanisms; None where there are none.
     """
 
@@ -49,6 +50,7 @@ class JointMotion(NamedTuple):
     middle: JointRows
     coefficients: Coefficients
     inertia: Inertia
+    turning: Array | None = None
     responses: Responses | None = None
 
 
@@ -86,8 +88,9 @@ def _rows(
     def of_each(name: str) -> Any:
         return _by_law(laws, {law: getattr(response, name) for law, response in found.items()})
 
-    curvature = select(table, motion.middle.rate - motion.start.rate)
-    bias = of_each("bias") + jnp.where(curved[:, None], curvature, 0.0)
+    bias = of_each("bias")
+    if motion.turning is not None and curved.any():
+        bias = bias + jnp.where(curved[:, None], select(table, motion.turning), 0.0)
     if decoupling is not None:
         bias = decoupling.rows(bias)
     worlds = max(jnp.shape(value)[-1] for value in (mass, error, *coefficients.values()))

@@ -103,7 +103,8 @@ def constrain(
         if mechanism_layout.layout(scene) is not None:
             held = mechanism.links(scene, middle, moving(scene, there).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action)
-        joint_motion = joint.JointMotion(joints, middle, coefficients, inertia)
+        turning = joint_rows.turning(model, bodies, joints, middle)
+        joint_motion = joint.JointMotion(joints, middle, coefficients, inertia, turning)
         order = joint_layout.joint_tables(scene)
         if decoupling.applies(scene):
             rows_of = substep_rows.joint_rows if small_steps else joint.decoupled_rows

@@ -34,9 +34,7 @@ def joint_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) ->
     The turning of the Jacobian and the errors of the rows that hold are left to `joint_error`.
     """
     error = jnp.where((motion.start.laws == HOLD)[:, None], 0.0, motion.start.error)
-    still = motion._replace(
-        start=motion.start._replace(error=error), middle=motion.middle._replace(rate=motion.start.rate)
-    )
+    still = motion._replace(start=motion.start._replace(error=error), turning=None)
     part = dataclasses.replace(model, dt=model.dt / scene.options.substep_count)
     return joint.decoupled_rows(scene, table, part, still)
 
@@ -52,9 +50,8 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
         return pack_scalars(table, [decoupling.rows(values)], worlds)
 
     curvature = None
-    if curved.any():
-        turning = take(motion.middle.rate - motion.start.rate, slots)
-        curvature = packed(jnp.where(curved[:, None], turning, 0.0))
+    if motion.turning is not None and curved.any():
+        curvature = packed(jnp.where(curved[:, None], take(motion.turning, slots), 0.0))
     linear = jax.tree.leaves((motion.start.parent.linear, motion.start.child.linear))
     moves = functools.reduce(jnp.logical_or, [take(part, slots) != 0 for part in linear])
     radius = pack_scalars(table, [_smallest_radius(scene, rows, model)], worlds)
