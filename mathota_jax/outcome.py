@@ -11,7 +11,7 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, place
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints import compact, joint_layout, loops
+from mathota_jax.constraints import compact, compact_matching, joint_layout, loops
 from mathota_jax.constraints.assembly import collect
 from mathota_jax.constraints.contact_force import slot_force
 from mathota_jax.constraints.decoupling import Decoupling
@@ -67,7 +67,7 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
         if problem.contacts.converged is not None or problem.close is not None:
             flags.append(_collision_flags(problem.contacts, problem.close))
         if problem.close is not None:
-            changes["contact_pair"] = compact.pair_keys(scene, problem.close)
+            changes["contact_pair"] = compact_matching.pair_keys(scene, problem.close)
     return {**changes, "flags": functools.reduce(jnp.bitwise_or, flags)} if flags else changes
 
 

@@ -18,6 +18,7 @@ from mathota_jax.constraints import (
     joint_rows,
     loops,
     mechanism,
+    mechanism_correction,
     mechanism_rows,
     motor,
     rebound_limit,
@@ -245,7 +246,9 @@ def close_joints(
         is_last, known = of_round
         inertia = moving_inertia(scene, model, moved.orientation)
         joints = joint_rows.joint_rows(model, merge(scene, bodies, moved))
-        weights = jax.tree.map(lambda a, b: jnp.where(is_last, a, b), inertia, mechanism.correction_weights(inertia))
+        weights = jax.tree.map(
+            lambda a, b: jnp.where(is_last, a, b), inertia, mechanism_correction.correction_weights(inertia)
+        )
         links = mechanism.links(scene, joints, moved.position, weights)
         velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
         excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
@@ -257,7 +260,7 @@ def close_joints(
         moved = moved._replace(velocity=linear, angular_velocity=angular)
         if not rounds:
             return moved, impulses
-        shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism.bounded(change))
+        shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism_correction.bounded(change))
         return displace(moved, inertia, shift), impulses
 
     rounds = mechanism.ROUNDS if scene.options.position_iterations else 0

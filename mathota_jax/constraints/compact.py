@@ -10,7 +10,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -18,18 +17,16 @@ from jax import Array
 from mathota_jax.bodies import Bodies, of_all_bodies
 from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
-from mathota_jax.collision.broadphase.ranges import lower_bound
 from mathota_jax.collision.compact import compact_contacts
 from mathota_jax.collision.narrowphase import ContactSet, stored
 from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
-from mathota_jax.constraints.warm_start import matched_points
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours
 from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.chunks import map_filled
-from mathota_jax.spatial.indexing import gather, in_every_world, take
+from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.vector import Vec3, norm
 
 NO_PAIR = -1
@@ -102,7 +99,7 @@ def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[Contact
     sets = []
     for group, places in zip(scene.compact_groups, close.groups, strict=True):
         contacts, pairs = _narrow_phase(model, group, bodies), (places.pair, places.active)
-        sets.append(map_filled(contacts, pairs, _filled(places)) if scene.broadphase.one_by_one else contacts(pairs))
+        sets.append(map_filled(contacts, pairs, filled(places)) if scene.broadphase.one_by_one else contacts(pairs))
     return sets
 
 
@@ -137,10 +134,17 @@ def _narrow_phase(model: Model, group: CompactGroup, bodies: Bodies) -> Callable
     return contacts
 
 
-def pair_keys(scene: Scene, close: ClosePairs) -> Array:
-    """(place, world) what `State.contact_pair` keeps."""
-    keys = [_key(scene, *p.pair) for p in close.groups]
-    return jnp.concatenate([jnp.where(p.active, key, NO_PAIR) for p, key in zip(close.groups, keys, strict=True)])
+def pair_key(scene: Scene, first: Array, second: Array) -> Array:
+    """Number of a pair of shapes, ascending in the first and then the second."""
+    assert scene.broadphase is not None
+    return first * len(scene.broadphase.shapes) + second
+
+
+def filled(places: GroupPlaces) -> Array:
+    """() number of places that hold a pair in some world, where each pair has a turn of its own."""
+    (_, placed), *_ = places.tables
+    assert placed.places.turns is not None
+    return placed.places.turns
 
 
 def slot_bodies(scene: Scene, close: ClosePairs) -> tuple[Array, Array]:
@@ -153,117 +157,6 @@ def slot_bodies(scene: Scene, close: ClosePairs) -> tuple[Array, Array]:
             jnp.concatenate([jnp.repeat(body_of[p.pair[side]], group.point_count, axis=0) for group, p in parts])
         )
     return tuple(sides)  # type: ignore[return-value]
-
-
-def matched_force(
-    scene: Scene, close: ClosePairs, contacts: ContactSet, force: Vec3, feature: Array, pair: Array
-) -> list[Vec3]:
-    """Forces of the last step in the slots where their pairs and features are now, a vector for each compact group.
-
-    Args:
-      scene, close, contacts: static structure, and what is close in this step; all slots.
-      force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
-    """
-    assert scene.broadphase is not None
-    one_by_one = scene.broadphase.one_by_one
-    sources = [] if one_by_one else _sources(scene, close, pair)
-    parts, slot = [], scene.static_slot_count
-    for number, (group, p) in enumerate(zip(scene.compact_groups, close.groups, strict=True)):
-        rows = range(slot, slot + group.slot_count)
-        shape = (group.place_count, group.point_count, -1)
-        found = [x.reshape(shape) for x in take((contacts.feature, contacts.active), rows)]
-        old = jax.tree.map(lambda x, shape=shape: x.reshape(shape), take((feature, force), rows))
-
-        def matched(places: tuple, number: int = number, old: tuple[Array, Vec3] = old) -> Vec3:
-            where, new_feature, active = places
-            source, known = _known_places(scene, pair, number, *where) if one_by_one else where
-            old_feature, *old_force = [gather(x, source) for x in jax.tree.leaves(old)]
-            old_feature = jnp.where(known[:, None], old_feature, NO_PAIR)
-            return matched_points(old_feature, new_feature, active, Vec3(*old_force))
-
-        if one_by_one:
-            parts.append(map_filled(matched, ((_key(scene, *p.pair), p.active), *found), _filled(p)))
-        else:
-            parts.append(matched((sources[number], *found)))
-        slot += group.slot_count
-    return parts
-
-
-def _filled(places: GroupPlaces) -> Array:
-    """() number of places that hold a pair in some world, where each pair has a turn of its own."""
-    (_, placed), *_ = places.tables
-    assert placed.places.turns is not None
-    return placed.places.turns
-
-
-def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair: Array) -> tuple[Array, Array]:
-    """Forces (slot, 3, world) and features (slot, world) of the last step in the slots where their pairs are now.
-
-    Args:
-      scene, close: static structure, and what is close in this step.
-      force, feature, pair: what the state keeps: (slot, 3, world), (slot, world) and (place, world).
-    """
-    own = range(scene.static_slot_count)
-    forces, features = [take(force, own)] if own else [], [take(feature, own)] if own else []
-    slot = scene.static_slot_count
-    for group, (source, known) in zip(scene.compact_groups, _sources(scene, close, pair), strict=True):
-        points = jnp.arange(group.point_count, dtype=jnp.int32)[None, :, None]
-        slots = slot + source[:, None] * group.point_count + points
-        slots = slots.reshape(group.slot_count, -1)
-        known = jnp.repeat(known, group.point_count, axis=0)
-        forces.append(jnp.where(known[:, None], gather(force, slots), 0.0))
-        features.append(jnp.where(known, gather(feature, slots), NO_PAIR))
-        slot += group.slot_count
-    worlds = max(values.shape[-1] for values in (*forces, *features))
-
-    def join(parts: list[Array]) -> Array:
-        return jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:-1], worlds)) for part in parts])
-
-    return join(forces), join(features)
-
-
-def _sources(scene: Scene, close: ClosePairs, pair: Array) -> list[tuple[Array, Array]]:
-    """For each compact group, (place, world): its place that held the pair in the last step, and whether there was one."""
-    assert scene.broadphase is not None
-    if scene.broadphase.one_by_one:
-        places = enumerate(close.groups)
-        return [_known_places(scene, pair, number, _key(scene, *p.pair), p.active) for number, p in places]
-    previous = _previous_places(scene, close.found, pair)
-    sources, first = [], 0
-    for group, p in zip(scene.compact_groups, close.groups, strict=True):
-        source = gather(previous, p.listed) - first
-        known = p.active & (source >= 0) & (source < group.place_count)
-        sources.append((jnp.clip(source, 0, group.place_count - 1), known))
-        first += group.place_count
-    return sources
-
-
-def _known_places(scene: Scene, pair: Array, number: int, key: Array, active: Array) -> tuple[Array, Array]:
-    """`_sources` of some places of the group `number`, where each pair has a turn of its own: the keys of a group ascend."""
-    counts = [group.place_count for group in scene.compact_groups]
-    first = sum(counts[:number])
-    old = take(pair, range(first, first + counts[number]))
-    old = jnp.where(old == NO_PAIR, jnp.iinfo(jnp.int32).max, old)
-    place = jnp.minimum(lower_bound(old, key), counts[number] - 1)
-    return place, active & (gather(old, place) == key)
-
-
-def _key(scene: Scene, first: Array, second: Array) -> Array:
-    assert scene.broadphase is not None
-    return first * len(scene.broadphase.shapes) + second
-
-
-def _previous_places(scene: Scene, found: PairList, pair: Array) -> Array:
-    """(listed pair, world) place that held the pair in the last step, -1 for none."""
-    keys = jnp.where(found.active, _key(scene, found.first, found.second), jnp.iinfo(jnp.int32).max)
-    count = keys.shape[0]
-    pair = in_every_world(pair, max(pair.shape[-1], keys.shape[-1]))
-    where = lower_bound(keys, pair)
-    same = (pair != NO_PAIR) & (where < count) & (gather(keys, jnp.minimum(where, count - 1)) == pair)
-    places = jnp.broadcast_to(jnp.arange(pair.shape[0], dtype=jnp.int32)[:, None], where.shape)
-    target = jnp.where(same, where, count)
-    worlds = where.shape[-1]
-    return jnp.full((count, worlds), NO_PAIR, jnp.int32).at[target, jnp.arange(worlds)].set(places, mode="drop")
 
 
 def _places(scene: Scene, found: PairList) -> tuple[list[GroupPlaces], Array]:
@@ -321,7 +214,7 @@ def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array
         block_count = len(scene.dynamic_bodies)
         node_count = len(scene.compact_groups) * block_count
         nodes = tuple(jnp.where(end < block_count, end + group_of_pair * block_count, node_count) for end in ends)
-        priority = (_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
+        priority = (pair_key(scene, found.first, found.second) * jnp.int32(HASH)) & jnp.iinfo(jnp.int32).max
         colour = edge_colours(nodes, priority, active, node_count, turn_count)  # type: ignore[arg-type]
 
     # Sorted by group, turn and place in the list: the pairs of a turn follow one another.

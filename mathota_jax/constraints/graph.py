@@ -12,7 +12,7 @@ from jax import Array
 from mathota_jax.bodies import Edges
 from mathota_jax.collision.bounds import admissible_pairs
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints import compact
+from mathota_jax.constraints import compact, compact_matching
 from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.slots import bodies_of_slots
 from mathota_jax.model import Model
@@ -146,4 +146,4 @@ def _in_present_slots(scene: Scene, close: compact.ClosePairs | None, old: State
     if close is None:
         return force, old.contact_feature
     assert old.contact_pair is not None
-    return compact.carried(scene, close, force, old.contact_feature, old.contact_pair)
+    return compact_matching.carried(scene, close, force, old.contact_feature, old.contact_pair)

@@ -28,7 +28,7 @@ from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.slots import matched_force, own_contacts
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
-from mathota_jax.solver.soft_step import PositionError
+from mathota_jax.solver.soft_laws import PositionError
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State

@@ -7,7 +7,7 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, vector
 from mathota_jax.collision.narrowphase import ContactSet, find_contacts, join_contacts, stored
-from mathota_jax.constraints import compact, warm_start
+from mathota_jax.constraints import compact, compact_matching, warm_start
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.settle import compute_once
@@ -66,5 +66,5 @@ def matched_force(
     parts = compute_once(warm_start.matched_force(scene, contacts, old, feature), force)
     if close is not None:
         assert state.contact_pair is not None
-        parts += compact.matched_force(scene, close, contacts, old, feature, state.contact_pair)
+        parts += compact_matching.matched_force(scene, close, contacts, old, feature, state.contact_pair)
     return warm_start.join_forces(parts)

@@ -19,7 +19,7 @@ from mathota_jax.constraints.joints.rows import HOLD, STOP
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.rows import Rows
-from mathota_jax.solver.soft_step import ForceLaws, PositionError
+from mathota_jax.solver.soft_laws import ForceLaws, PositionError
 from mathota_jax.solver.table import Table
 from mathota_jax.spatial.indexing import take
 
