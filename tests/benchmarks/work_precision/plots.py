@@ -82,6 +82,9 @@ def _panel(panel: Any, scene: str, points: list[dict], handles: dict[str, Any]) 
     panel.set_title(scene)
     panel.grid(True, which="major", alpha=0.3)
     panel.tick_params(labelsize=8)
+    # Where an axis spans less than two decades, names of all its ticks would run into one another.
+    panel.xaxis.set_minor_formatter("")
+    panel.yaxis.set_minor_formatter("")
 
 
 def _rank(engine: str, setting: str) -> int:
