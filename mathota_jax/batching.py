@@ -28,10 +28,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.core import ShapedArray, Tracer
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from mathota_jax.spatial.varying import as_varying, result_types
 from mathota_jax.spatial.world_parts import by_parts, part_size, parts_pay
 
 
@@ -71,7 +72,7 @@ def batch_last(
     @functools.wraps(function)
     def natural(*args: Any) -> Any:
         leaves, in_tree = jax.tree.flatten(args)
-        leaves = [jnp.asarray(leaf) for leaf in leaves]
+        leaves = as_varying([jnp.asarray(leaf) for leaf in leaves])
         native = TreeFunction(function, in_tree, shortcut, in_parts)
         out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
         return jax.tree.unflatten(_out_tree(native, _natural_signatures(leaves, 0)), out_leaves)
@@ -266,7 +267,7 @@ def _abstract_evaluation(*avals: Any, native: Native, world_axes: int) -> list[A
     worlds = _worlds(avals, world_axes)
     shapes = (jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals)
     merged = [jax.eval_shape(lambda arg: _merge_worlds(arg, worlds), shape) for shape in shapes]
-    return [ShapedArray((*shape, *worlds), dtype) for shape, dtype in _natural_results(native, merged)]
+    return result_types([((*shape, *worlds), dtype) for shape, dtype in _natural_results(native, merged)], avals)
 
 
 def _natural_results(native: Native, args: Sequence[Any]) -> list[Signature]:
