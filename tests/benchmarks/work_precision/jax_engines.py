@@ -33,9 +33,9 @@ def missing() -> dict[str, str]:
     return {"Brax spring" if name == "Brax" else name: reason for name, reason in absent.items()}
 
 
-def program(name: str, scene: Scene) -> JaxProgram:
-    """The scene of free bodies in one of the engines."""
-    return {"MJX": _mjx, "Brax spring": _brax}[name](scene, BATCHES[name])
+def program(name: str, scene: Scene, count: int | None = None) -> JaxProgram:
+    """The scene of free bodies in one of the engines, in as many worlds as suit it, or `count`."""
+    return {"MJX": _mjx, "Brax spring": _brax}[name](scene, count or BATCHES[name])
 
 
 def _coordinates(scene: Scene, count: int) -> tuple[jax.Array, jax.Array]:

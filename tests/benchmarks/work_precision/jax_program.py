@@ -71,6 +71,11 @@ class JaxProgram:
         self.final = states
         return stack(frames)
 
+    def after(self, steps: int, dt: float) -> Any:
+        """States a number of steps after the start."""
+        with jax.enable_x64(self.double):
+            return self._compiled[0](self.parameters(dt), self.states, np.int32(steps))
+
     def block(self, scene: Scene, dt: float) -> Block:
         """Runs the whole horizon."""
         return self.block_of(steps_of(scene, dt), dt)

@@ -1,0 +1,1 @@
+"""Thousands of worlds on whatever device JAX finds, beside MJX and MuJoCo Warp."""
