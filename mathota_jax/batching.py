@@ -72,7 +72,7 @@ def batch_last(
     @functools.wraps(function)
     def natural(*args: Any) -> Any:
         leaves, in_tree = jax.tree.flatten(args)
-        leaves = as_varying([jnp.asarray(leaf) for leaf in leaves])
+        leaves = as_varying([leaf if isinstance(leaf, Array) else jnp.asarray(leaf) for leaf in leaves])
         native = TreeFunction(function, in_tree, shortcut, in_parts)
         out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
         return jax.tree.unflatten(_out_tree(native, _natural_signatures(leaves, 0)), out_leaves)

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 from jax import Array, lax
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
 
 
 def as_varying(arrays: Sequence[Array]) -> list[Array]:
@@ -20,6 +20,8 @@ def as_varying(arrays: Sequence[Array]) -> list[Array]:
 
     The cotangent of one that all devices share is the sum of theirs.
     """
+    if not any(isinstance(array, Tracer) for array in arrays):
+        return list(arrays)
     axes = [_axes(jax.typeof(array)) for array in arrays]
     union = frozenset().union(*axes)
     return [
