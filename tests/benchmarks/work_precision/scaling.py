@@ -55,7 +55,7 @@ def _worlds(counts: tuple[int, ...], settings: Settings) -> list[dict]:
 def _single(settings: Settings) -> dict[str, Any]:
     """CPU and wall time [us] of a step of one cube on a plane, called from Python and inside a loop."""
     model, state = engine.build(SCENES["slide"].world, engine.undamped(SCENES["slide"], "pgs"))
-    call = jax.jit(lambda model, state: step(model, state)).lower(model, state).compile()
+    call = jax.jit(step)
     loop = engine.program(SCENES["slide"], "pgs", 1).block_of(CALLS, TIME_STEP)
 
     def calls() -> int:
