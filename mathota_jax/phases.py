@@ -24,6 +24,7 @@ from mathota_jax.constraints import (
     rebound_limit,
 )
 from mathota_jax.constraints.mechanism_layout import (
+    Layout,
     bounded_slots,
     covers,
     covers_with_bounds,
@@ -249,10 +250,14 @@ def close_joints(
         weights = jax.tree.map(
             lambda a, b: jnp.where(is_last, a, b), inertia, mechanism_correction.correction_weights(inertia)
         )
-        links = mechanism.links(scene, joints, moved.position, weights)
+        yielding = loops.yielding(model, joints.error)
+        if yielding is not None:
+            yielding = jnp.where(is_last, 0.0, yielding)
+        links = mechanism.links(scene, joints, moved.position, weights, yielding)
         velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
         excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
-        wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, errors)
+        correctable = mechanism.of_slots(links, loops.correctable(model, joints.error))
+        wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, correctable)
         impulses = mechanism.solve(links, wanted, known)
         change = mechanism.push(links, impulses)
         linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
@@ -269,7 +274,23 @@ def close_joints(
     if known is not None:
         # Nothing is left to be found that it would be cheaper to store than to compute again.
         close = jax.checkpoint(close, prevent_cse=False)
-    return lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
+    closed, impulses = lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
+    found = layout(scene)
+    if found is not None and found.closings:
+        closed = _without_gain(model, found, moved, closed)
+    return closed, impulses
+
+
+def _without_gain(model: Model, found: Layout, moved: Bodies, closed: Bodies) -> Bodies:
+    lift = (closed.position - moved.position).map(lambda x: x)
+    g = gravity(model)
+    inertia = moving_inertia(model.scene, model, closed.orientation)
+    gain = -dot(lift, g) / inertia.inverse_mass
+    kinetic = 0.5 * (dot(closed.velocity, closed.velocity) / inertia.inverse_mass + dot(closed.angular_velocity, inertia.apply(closed.angular_velocity)))
+    gain, kinetic = gain.sum(0), kinetic.sum(0)
+    share = jnp.clip(1.0 - safe_divide(jnp.maximum(gain, 0.0), kinetic), 0.0, 1.0)
+    scale = safe_sqrt(share)
+    return closed._replace(velocity=closed.velocity * scale, angular_velocity=closed.angular_velocity * scale)
 
 
 def stop_at_impacts(

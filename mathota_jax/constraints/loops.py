@@ -34,6 +34,17 @@ def correctable(model: Model, error: Array) -> Array:
     return error if limits is None else jnp.clip(error, -limits, limits)
 
 
+def yielding(model: Model, error: Array) -> Array | None:
+    """How far (slot, world) rows give way in a correction of the positions, see `mechanism_loops`; None without loops.
+
+    With the square of the error over what counts as open: near the solution Newton's method converges as ever, and a loop
+    that can not close moves no further in a round than it may be open. Source: N. Yamashita and M. Fukushima, "On the rate
+    of convergence of the Levenberg-Marquardt method", 2001.
+    """
+    limits = _limits(model)
+    return None if limits is None else lax.stop_gradient(jnp.clip(error / limits, -1.0, 1.0)) ** 2
+
+
 def _limits(model: Model) -> Array | None:
     """Errors (slot, world) beyond which joints of loops are open, infinite for all others; None where there is no loop."""
     scene = model.scene
