@@ -24,7 +24,6 @@ from mathota_jax.constraints import (
     rebound_limit,
 )
 from mathota_jax.constraints.mechanism_layout import (
-    Layout,
     bounded_slots,
     covers,
     covers_with_bounds,
@@ -268,7 +267,7 @@ def close_joints(
         shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism_correction.bounded(change))
         return displace(moved, inertia, shift), impulses
 
-    rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
+    rounds = mechanism.rounds(scene)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model, known)))
     moved = in_every_world(moved, worlds)
     if known is not None:
@@ -277,20 +276,9 @@ def close_joints(
     closed, impulses = lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
     found = layout(scene)
     if found is not None and found.closings:
-        closed = _without_gain(model, found, moved, closed)
+        inertia = moving_inertia(scene, model, closed.orientation)
+        closed = mechanism_correction.without_gain(found, inertia, gravity(model), moved, closed)
     return closed, impulses
-
-
-def _without_gain(model: Model, found: Layout, moved: Bodies, closed: Bodies) -> Bodies:
-    lift = (closed.position - moved.position).map(lambda x: x)
-    g = gravity(model)
-    inertia = moving_inertia(model.scene, model, closed.orientation)
-    gain = -dot(lift, g) / inertia.inverse_mass
-    kinetic = 0.5 * (dot(closed.velocity, closed.velocity) / inertia.inverse_mass + dot(closed.angular_velocity, inertia.apply(closed.angular_velocity)))
-    gain, kinetic = gain.sum(0), kinetic.sum(0)
-    share = jnp.clip(1.0 - safe_divide(jnp.maximum(gain, 0.0), kinetic), 0.0, 1.0)
-    scale = safe_sqrt(share)
-    return closed._replace(velocity=closed.velocity * scale, angular_velocity=closed.angular_velocity * scale)
 
 
 def stop_at_impacts(

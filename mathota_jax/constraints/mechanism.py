@@ -43,6 +43,9 @@ ROUNDS = 1
 Two change nothing for ten and twenty links at 1/60 s, and little for a heavy end.
 """
 
+LOOP_ROUNDS = 2
+"""The same where there are loops. A bridge as long as its span opens by half as much with two as with one."""
+
 Impulses = tuple[Array, ...]
 """Of the three translations and then the three rotations between each link and its parent, (link, world); 0 where free.
 
@@ -88,9 +91,16 @@ class Links:
     layout: Layout = static()
 
 
-def links(
-    scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia, yielding: Array | None = None
-) -> Links:
+def rounds(scene: Scene) -> int:
+    """How often the joints of a scene with mechanisms are closed at the end of a step."""
+    found = layout(scene)
+    assert found is not None
+    if not scene.options.position_iterations:
+        return 0
+    return LOOP_ROUNDS if found.closings else ROUNDS
+
+
+def links(scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia, yielding: Array | None = None) -> Links:
     """The mechanisms of a scene at given poses.
 
     Args:

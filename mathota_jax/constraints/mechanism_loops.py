@@ -11,8 +11,6 @@ themselves jump, and their derivative has no bound, where a loop passes through 
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,8 +92,9 @@ def _condense(
     force, torque = _forces(found, of_rows, units)
     motion = compute_once(tree.respond(found.tree, side_by_side, (_packed(force), _packed(torque))), units)
     matrix = _rates(found, of_rows, *(Vec3(*unstack(part, 1)) for part in motion)).reshape(count, count, worlds)
-    matrix = 0.5 * (matrix + jnp.swapaxes(matrix, 0, 1)) + jnp.eye(count, dtype=alone.dtype)[..., None] * compliance
-    inverse = dense.solve(matrix[None], jnp.broadcast_to(jnp.eye(count, dtype=alone.dtype)[None, ..., None], (1, *matrix.shape)))
+    unit = jnp.broadcast_to(jnp.eye(count, dtype=alone.dtype)[..., None], matrix.shape)
+    matrix = 0.5 * (matrix + jnp.swapaxes(matrix, 0, 1)) + unit * compliance
+    inverse = dense.solve(matrix[None], unit[None])
     responses = jax.tree.map(lambda x: x.reshape(*x.shape[:2], count, worlds), motion)
     return responses, matrix, inverse[0], compliance
 
@@ -138,9 +137,7 @@ def _forces(found: Layout, sides: tuple[Side, Side], impulses: Array) -> tuple[V
             nothing = nothing.at[np.where(places < 0, len(found.links), places)].add(part, mode="drop")
         return nothing
 
-    linear, angular = (
-        [getattr(side, name) * impulses for side in sides] for name in ("linear", "angular")
-    )
+    linear, angular = ([getattr(side, name) * impulses for side in sides] for name in ("linear", "angular"))
     return tuple(Vec3(*(total(list(pair)) for pair in zip(*parts, strict=True))) for parts in (linear, angular))  # type: ignore[return-value]
 
 
