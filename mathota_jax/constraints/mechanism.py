@@ -322,9 +322,9 @@ def _impulses(links: Links, wanted: Impulses) -> Impulses:
     found = _of_trees(links, wanted[:6])
     if links.loops is None:
         return found
-    links = lax.stop_gradient(links)
+    loops, links = lax.stop_gradient((links.loops, links))
     without = rates(links, push(links, (*found, jnp.zeros_like(wanted[6]))))
-    closing = mechanism_loops.impulses(links.loops, compute_once(wanted[6] - without[6], wanted[6]))
+    closing = mechanism_loops.impulses(loops, compute_once(wanted[6] - without[6], wanted[6]))
     alone = rates(links, push(links, (*map(jnp.zeros_like, found), closing)))
     found = _of_trees(links, tuple(map(jnp.subtract, wanted[:6], alone[:6])))
     return *found, closing

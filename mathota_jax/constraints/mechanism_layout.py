@@ -141,7 +141,10 @@ def _of_trees(scene: Scene, least: int) -> Layout | None:
     if not links:
         return None
     places = {GROUND: GROUND, **{link.block: place for place, link in enumerate(links)}}
-    closings = (Closing(*(places[block] for block in ends[joint]), held[joint]) for joint in closing)
+    closings = []
+    for joint in closing:
+        parent, child = ends[joint]
+        closings.append(Closing(places[parent], places[child], held[joint]))
     return Layout(tuple(links), len(scene.dynamic_bodies), tuple(closings))
 
 

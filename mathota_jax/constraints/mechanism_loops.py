@@ -73,7 +73,9 @@ def loops(
     sides = jax.tree.map(lambda x: x + like, take((joints.parent, joints.child), slots))
     sides = compute_once(sides, like)
     more = jnp.zeros(()) if yielding is None else take(yielding, slots)
-    return Loops(*sides, *lax.stop_gradient(_condense(found, sides, inertia, factors, more)), found)
+    parent, child = sides
+    responses, matrix, inverse, compliance = lax.stop_gradient(_condense(found, sides, inertia, factors, more))
+    return Loops(parent, child, responses, matrix, inverse, compliance, found)
 
 
 def _condense(
