@@ -61,12 +61,12 @@ class Options:
         ``load / (2 effective mass * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`,
         `baumgarte` and `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its
         restitution pass. All figures: docs/solvers.md.
-      exact_joints: joints that form a tree of three or more are solved together, exactly, and closed at the end of the step
-        (not with `impact_events`), and smaller trees where a scene has nothing else to solve ("soft_step": there alone);
-        joints of closed loops, and one or two beside contacts or limits, are left to the solver. Off: absent. Limits,
-        motors, springs and friction on their joints are solved with all that hangs on them, by `velocity_iterations` sweeps
-        of their own ("pgs"): on an arm whose end is a hundred times as heavy as its first link, a stop or a spring acts as
-        it would on one rigid body.
+      exact_joints: three or more joints that are connected, trees and closed loops, are solved together, exactly, and closed
+        at the end of the step (not with `impact_events`), and fewer where a scene has nothing else to solve ("soft_step":
+        there alone); one or two beside contacts or limits, and nets whose loops more than 96 rows close, are left to the
+        solver. Off: absent. Limits, motors, springs and friction on their joints are solved with all that hangs on them, by
+        `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred times as heavy as its first
+        link, a stop or a spring acts as it would on one rigid body.
         Without it an error travels one joint a sweep: ten links at 1/240 s part by 5e-3 of a link and twenty at 1/60 s gain
         energy without bound; with it no gap is left but round-off. A step of ten links with "pgs" takes 1.2 times as long.
       substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.

@@ -249,10 +249,14 @@ def close_joints(
         weights = jax.tree.map(
             lambda a, b: jnp.where(is_last, a, b), inertia, mechanism_correction.correction_weights(inertia)
         )
-        links = mechanism.links(scene, joints, moved.position, weights)
+        yielding = loops.yielding(model, joints.error)
+        if yielding is not None:
+            yielding = jnp.where(is_last, 0.0, yielding)
+        links = mechanism.links(scene, joints, moved.position, weights, yielding)
         velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
         excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
-        wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, errors)
+        closing = errors if yielding is None else mechanism.of_slots(links, loops.correctable(model, joints.error))
+        wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, closing)
         impulses = mechanism.solve(links, wanted, known)
         change = mechanism.push(links, impulses)
         linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
@@ -263,13 +267,18 @@ def close_joints(
         shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism_correction.bounded(change))
         return displace(moved, inertia, shift), impulses
 
-    rounds = mechanism.ROUNDS if scene.options.position_iterations else 0
+    rounds = mechanism.rounds(scene)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model, known)))
     moved = in_every_world(moved, worlds)
     if known is not None:
         # Nothing is left to be found that it would be cheaper to store than to compute again.
         close = jax.checkpoint(close, prevent_cse=False)
-    return lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
+    closed, impulses = lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
+    found = layout(scene)
+    if found is not None and found.closings:
+        inertia = moving_inertia(scene, model, closed.orientation)
+        closed = mechanism_correction.without_gain(found, inertia, gravity(model), moved, closed)
+    return closed, impulses
 
 
 def stop_at_impacts(

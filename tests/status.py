@@ -67,6 +67,9 @@ FEATURES = (
     Feature("converged solver (experimental)", "mathota_jax.solver:converged", "physics/test_converged.py"),
     Feature("fast bodies stopped at the time of impact", "mathota_jax.dynamics:events", "physics/test_fast_bodies.py"),
     Feature("chains and trees of joints solved exactly", "mathota_jax.constraints:mechanism", "physics/test_chain.py"),
+    Feature(
+        "closed loops of joints solved exactly", "mathota_jax.constraints:mechanism_loops", "physics/test_loops.py"
+    ),
     Feature("steps split at their impacts", "mathota_jax:impact_splitting", "physics/test_impact_events.py"),
     Feature("fitting parameters to recorded motion", "mathota_jax.fit:fit", "fit"),
     Feature(

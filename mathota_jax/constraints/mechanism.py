@@ -5,11 +5,12 @@ grows at large ones. Rows that hold have no bounds to respect, and the impulses 
 passes over its bodies (`solver.tree`). Rows of other laws and contacts are left to the sweeps, which start from the exact
 impulses and are followed by one more exact solution. With nothing but rows that hold no sweep is needed at all.
 
-A closed loop of joints is no tree and is left to the sweeps.
+Joints that close loops are added to the tree of the others (`mechanism_loops`).
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, mlir
 
 from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
+from mathota_jax.constraints import mechanism_loops
 from mathota_jax.constraints.assembly import Side, collect, pack_scalars, select
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import Layout, layout
@@ -41,8 +43,14 @@ ROUNDS = 1
 Two change nothing for ten and twenty links at 1/60 s, and little for a heavy end.
 """
 
+LOOP_ROUNDS = 2
+"""The same where there are loops. A bridge as long as its span opens by half as much with two as with one."""
+
 Impulses = tuple[Array, ...]
-"""Of the three translations and then the three rotations between each link and its parent, (link, world); 0 where free."""
+"""Of the three translations and then the three rotations between each link and its parent, (link, world); 0 where free.
+
+Where there are loops, those of the rows that close them, (row, world), follow.
+"""
 
 
 class Solutions(NamedTuple):
@@ -69,6 +77,7 @@ class Links:
       inertia: of the links.
       duals: translations and rotations along which one of the above is 1 and the others are 0.
       factors: of the elimination.
+      loops: rows that close loops; None where there are none.
       layout: which links there are.
     """
 
@@ -78,10 +87,20 @@ class Links:
     inertia: Inertia
     duals: tuple[tuple[Vec3, ...], tuple[Vec3, ...]]
     factors: tree.Factors
+    loops: mechanism_loops.Loops | None
     layout: Layout = static()
 
 
-def links(scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia) -> Links:
+def rounds(scene: Scene) -> int:
+    """How often the joints of a scene with mechanisms are closed at the end of a step."""
+    found = layout(scene)
+    assert found is not None
+    if not scene.options.position_iterations:
+        return 0
+    return LOOP_ROUNDS if found.closings else ROUNDS
+
+
+def links(scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia, yielding: Array | None = None) -> Links:
     """The mechanisms of a scene at given poses.
 
     Args:
@@ -89,6 +108,7 @@ def links(scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia) -> 
       joints: rows at these poses.
       position: of the moving bodies.
       inertia: with which the moving bodies respond.
+      yielding: how far rows (slot, world) that close loops give way, see `mechanism_loops`.
     """
     found = layout(scene)
     assert found is not None
@@ -99,7 +119,8 @@ def links(scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia) -> 
     translations, rotations = compute_once(_basis(found, joints, position.x), position.x)
     fixed = lax.stop_gradient((translations, rotations, offset, inertia))
     duals, factors = _factorize(found, *fixed)
-    return Links(translations, rotations, offset, inertia, duals, factors, found)
+    loops = mechanism_loops.loops(found, joints, inertia, factors, yielding) if found.closings else None
+    return Links(translations, rotations, offset, inertia, duals, factors, loops, found)
 
 
 def _column(flags: Any) -> np.ndarray:
@@ -207,11 +228,13 @@ def _unpack(pair: tree.Pair) -> tuple[Vec3, Vec3]:
 def rates(links: Links, velocity: Array) -> Impulses:
     """Rates along all rows of the velocities (component, block, world)."""
     linear, angular = take(unpack_blocks(velocity), links.layout.blocks)
+    closing = () if links.loops is None else (mechanism_loops.rates(links.loops, linear, angular),)
     parent_linear, parent_angular = (_of_parents(links.layout, part) for part in (linear, angular))
     linear = linear - parent_linear - cross(parent_angular, links.offset)
     linear, angular = _stored(links, linear, angular - parent_angular)
     found = [dot(side.linear, linear) + dot(side.angular, angular) for side in links.translations]  # type: ignore[arg-type]
-    return store_cotangents(_held(links, [*found, *(dot(direction, angular) for direction in links.rotations)]))
+    found += [dot(direction, angular) for direction in links.rotations]
+    return store_cotangents(_held(links, (*found, *closing)))
 
 
 def _stored(links: Links, linear: Vec3, angular: Vec3) -> tuple[Vec3, Vec3]:
@@ -226,11 +249,13 @@ def push(links: Links, impulses: Impulses) -> Array:
     for side, impulse in zip(links.translations, impulses[:3], strict=True):
         assert side.angular is not None
         force, torque = force + side.linear * impulse, torque + side.angular * impulse
-    for direction, impulse in zip(links.rotations, impulses[3:], strict=True):
+    for direction, impulse in zip(links.rotations, impulses[3:6], strict=True):
         torque = torque + direction * impulse
     force, torque = store_cotangents(_stored(links, force, torque))
     carried = torque + cross(links.offset, force)
     force, torque = force - _to_parents(links.layout, force), torque - _to_parents(links.layout, carried)
+    if links.loops is not None:
+        force, torque = map(operator.add, (force, torque), mechanism_loops.forces(links.loops, impulses[6]))
     return _to_blocks(links.layout, pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque)))
 
 
@@ -246,13 +271,22 @@ def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impu
         return tuple(_known_solution_p.bind(*leaves, tree=tree))
 
     def product(impulses: Impulses) -> Impulses:
-        changes = rates(links, push(links, _held(links, impulses)))
-        return tuple(
+        changes = _changes(links, _held(links, impulses))
+        of_trees = (
             jnp.where(flags[:, None], change, impulse)
-            for flags, change, impulse in zip(links.layout.held, changes, impulses, strict=True)
+            for flags, change, impulse in zip(links.layout.held, changes[:6], impulses[:6], strict=True)
         )
+        return *of_trees, *changes[6:]
 
     return lax.custom_linear_solve(product, wanted, lambda _, right: _impulses(links, right), symmetric=True)
+
+
+def _changes(links: Links, impulses: Impulses) -> Impulses:
+    """Changes of the rates by impulses, and how far the rows that close loops give way to them."""
+    changes = rates(links, push(links, impulses))
+    if links.loops is None:
+        return changes
+    return *changes[:6], changes[6] + links.loops.compliance * impulses[6]
 
 
 def _known_solution(*leaves: Array, tree: Any) -> list[Array]:
@@ -266,7 +300,7 @@ def _known_solution_jvp(
     d_links, d_wanted, _ = jax.tree.unflatten(tree, [ad.instantiate_zeros(tangent) for tangent in tangents])
     # Not `known` itself, which is constant: this depends on the links and wanted rates when it is differentiated again.
     found = tuple(_known_solution_p.bind(*primals, tree=tree))
-    changes = jax.jvp(lambda links: rates(links, push(links, found)), (links,), (d_links,))[1]
+    changes = jax.jvp(lambda links: _changes(links, found), (links,), (d_links,))[1]
     right = _held(links, jax.tree.map(jnp.subtract, d_wanted, changes))
     return list(found), list(solve(links, right))
 
@@ -285,6 +319,19 @@ mlir.register_lowering(_known_solution_p, mlir.lower_fun(_known_solution, multip
 
 def _impulses(links: Links, wanted: Impulses) -> Impulses:
     """`solve` without derivatives."""
+    found = _of_trees(links, wanted[:6])
+    if links.loops is None:
+        return found
+    loops, links = lax.stop_gradient((links.loops, links))
+    without = rates(links, push(links, (*found, jnp.zeros_like(wanted[6]))))
+    closing = mechanism_loops.impulses(loops, compute_once(wanted[6] - without[6], wanted[6]))
+    alone = rates(links, push(links, (*map(jnp.zeros_like, found), closing)))
+    found = _of_trees(links, tuple(map(jnp.subtract, wanted[:6], alone[:6])))
+    return *found, closing
+
+
+def _of_trees(links: Links, wanted: Impulses) -> Impulses:
+    """The same where nothing closes loops."""
     translations, duals = lax.stop_gradient((links.translations, links.duals))
     # Each goes into all components of a motion.
     wanted = compute_once(wanted, wanted[0])
@@ -308,6 +355,8 @@ def respond(links: Links, impulse: Array) -> Array:
     of_links = take(unpack_blocks(impulse), links.layout.blocks)
     worlds = max(impulse.shape[-1], links.factors.offset.shape[-1])
     motion = tree.respond(links.layout.tree, links.factors, in_every_world(_pack(*of_links), worlds))
+    if links.loops is not None:
+        motion = mechanism_loops.respond_to(links.loops, motion)
     return _to_blocks(links.layout, pack_blocks(*_unpack(motion)))
 
 
@@ -334,33 +383,41 @@ def _combine(directions: tuple[Vec3, ...], values: Impulses) -> Vec3:
 
 def _held(links: Links, values: Any) -> Impulses:
     """Values of rows, 0 where nothing is held."""
-    return tuple(
+    of_trees = (
         value if flags.all() else jnp.where(flags[:, None], value, 0.0)
-        for value, flags in zip(values, links.layout.held, strict=True)
+        for value, flags in zip(values[:6], links.layout.held, strict=True)
     )
+    return *of_trees, *values[6:]
 
 
 def of_slots(links: Links, values: Array) -> Impulses:
     """Values of rows from those in slot order."""
-    return _held(links, [take(values, slots) for slots in links.layout.row_slots])
+    closing = [take(values, links.layout.closing_slots)] if links.layout.closings else []
+    return _held(links, [*(take(values, slots) for slots in links.layout.row_slots), *closing])
 
 
 def to_slots(links: Links, values: Impulses, slot_count: int) -> Array:
     """Values in slot order, 0 for rows that mechanisms do not hold."""
     held = links.layout.held
-    place = np.full(slot_count, held.size)
+    closing = list(links.layout.closing_slots)
+    place = np.full(slot_count, held.size + len(closing))
     place[links.layout.row_slots[held]] = np.flatnonzero(held)
+    place[closing] = held.size + np.arange(len(closing))
     return take(jnp.concatenate([*values, jnp.zeros_like(values[0][:1])]), place)
 
 
 def closing_shift(links: Links, errors: Impulses) -> Array:
     """Displacement (component, block, world) without turns that closes the joints, the floating trees about their centres.
 
-    The place of a link follows from that of its parent: this is exact where all three translations of a joint are held.
+    The place of a link follows from that of its parent: this is exact where all three translations of a joint are held. What
+    is then left at the joints that close loops is shared by all.
     """
     duals = links.duals[0]
     jump = _combine(duals, errors[:3]) * -1.0
-    shift, _ = _unpack(tree.follow(links.layout.tree, links.factors.offset, _pack(jump, jump * 0.0)))
+    shift, turn = _unpack(tree.follow(links.layout.tree, links.factors.offset, _pack(jump, jump * 0.0)))
+    if links.loops is not None:
+        left = errors[6] + mechanism_loops.rates(links.loops, shift, turn)
+        shift = shift + mechanism_loops.share_gaps(links.layout, mechanism_loops.gaps(links.loops, left))
     mass = 1.0 / links.inertia.inverse_mass
     for members in links.layout.floating_trees:
         of_tree = _column(np.isin(np.arange(len(links.layout.links)), members))

@@ -18,6 +18,9 @@ LEAST_JOINTS = 3
 """Joints of the smallest mechanism beside other rows: two converge in a few sweeps, which are cheaper. Where there are no
 others, no sweep is needed at all, and one joint is enough."""
 
+MOST_CLOSING = 96
+"""Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
+
 
 class Link(NamedTuple):
     """A body of a mechanism.
@@ -35,12 +38,31 @@ class Link(NamedTuple):
     is_child: bool = True
 
 
+class Closing(NamedTuple):
+    """A joint that closes a loop of links.
+
+    Attributes:
+      parent, child: places among the links of what the joint calls so, `GROUND` for none.
+      slots: as of a `Link`.
+    """
+
+    parent: int
+    child: int
+    slots: tuple[tuple[int, ...], tuple[int, ...]]
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """All slots."""
+        return (*self.slots[0], *self.slots[1])
+
+
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """The links of all mechanisms of a scene, parents first."""
+    """The links of all mechanisms of a scene, parents first, and the joints that no tree of links has."""
 
     links: tuple[Link, ...]
     block_count: int
+    closings: tuple[Closing, ...] = ()
 
     @functools.cached_property
     def blocks(self) -> tuple[int, ...]:
@@ -69,6 +91,11 @@ class Layout:
     def slots(self) -> tuple[int, ...]:
         """All slots, in the order in which `held` says which impulse of which link they are."""
         return tuple(slot for link in self.links for rows in link.slots for slot in rows)
+
+    @functools.cached_property
+    def closing_slots(self) -> tuple[int, ...]:
+        """Slots of the rows that close loops, joint by joint."""
+        return tuple(slot for closing in self.closings for slot in closing.rows)
 
     @functools.cached_property
     def held(self) -> np.ndarray:
@@ -104,17 +131,43 @@ def _of_trees(scene: Scene, least: int) -> Layout | None:
     """All trees of at least so many joints; None if there is none."""
     held, ends = _held_joints(scene)
     links: list[Link] = []
+    closing: list[int] = []
     for joints in _components(ends, len(scene.dynamic_bodies)):
-        grounded = sum(GROUND in ends[joint] for joint in joints)
-        bodies = {block for joint in joints for block in ends[joint]} - {GROUND}
-        if len(joints) >= least and grounded <= 1 and len(joints) == len(bodies) - 1 + grounded:
-            _grow(links, joints, ends, held)
-    return Layout(tuple(links), len(scene.dynamic_bodies)) if links else None
+        spanning = _spanning(joints, ends, held)
+        beside = [joint for joint in joints if joint not in spanning]
+        if len(joints) >= least and sum(len(rows) for joint in beside for rows in held[joint]) <= MOST_CLOSING:
+            _grow(links, [joint for joint in joints if joint in spanning], ends, held)
+            closing += beside
+    if not links:
+        return None
+    places = {GROUND: GROUND, **{link.block: place for place, link in enumerate(links)}}
+    closings = []
+    for joint in closing:
+        parent, child = ends[joint]
+        closings.append(Closing(places[parent], places[child], held[joint]))
+    return Layout(tuple(links), len(scene.dynamic_bodies), tuple(closings))
+
+
+def _spanning(joints: list[int], ends: dict[int, tuple[int, ...]], held: dict[int, _Slots]) -> set[int]:
+    """Joints of a tree that spans all bodies of some connected ones: of each loop, one that holds least is left out."""
+    by_rows = sorted(joints, key=lambda joint: -sum(map(len, held[joint])))
+    grounded = [joint for joint in by_rows if GROUND in ends[joint]]
+    found, label = set(grounded[:1]), {block: block for joint in joints for block in ends[joint]}
+    for joint in by_rows:
+        first, second = (_root(label, block) for block in ends[joint])
+        if joint not in grounded and first != second:
+            found.add(joint)
+            label[first] = second
+    return found
 
 
 def _has_no_others(scene: Scene, found: Layout) -> bool:
     """Whether the scene has no other rows than those of some mechanisms."""
-    return not scene.slot_count and len(found.slots) == joint_row_count(scene)
+    return not scene.slot_count and _row_count(found) == joint_row_count(scene)
+
+
+def _row_count(found: Layout) -> int:
+    return len(found.slots) + len(found.closing_slots)
 
 
 @functools.cache
@@ -145,7 +198,7 @@ def covers_with_bounds(scene: Scene) -> bool:
     found = layout(scene)
     if found is None or scene.slot_count:
         return False
-    return len(found.slots) + len(bounded_slots(scene)) == joint_row_count(scene)
+    return _row_count(found) + len(bounded_slots(scene)) == joint_row_count(scene)
 
 
 @functools.cache
@@ -164,7 +217,7 @@ def bounded_slots(scene: Scene) -> tuple[int, ...]:
         if {block_of[body] for body in (scene.joints[joint].parent, scene.joints[joint].child) if body in block_of}
         <= links
     ]
-    return tuple(sorted(set(slots) - set(found.slots)))
+    return tuple(sorted(set(slots) - set(found.slots) - set(found.closing_slots)))
 
 
 def _held_joints(scene: Scene) -> tuple[dict[int, _Slots], dict[int, tuple[int, ...]]]:
@@ -192,20 +245,21 @@ def held_slots(group: JointGroup, place: int) -> _Slots:
 
 def _components(ends: dict[int, tuple[int, ...]], block_count: int) -> list[list[int]]:
     """Joints that are connected through moving bodies."""
-    label = list(range(block_count))
-
-    def root(block: int) -> int:
-        while label[block] != block:
-            block = label[block]
-        return block
-
+    label = {block: block for block in range(block_count)}
     for blocks in ends.values():
         if GROUND not in blocks:
-            label[root(blocks[0])] = root(blocks[1])
+            label[_root(label, blocks[0])] = _root(label, blocks[1])
     found: dict[int, list[int]] = {}
     for joint, blocks in ends.items():
-        found.setdefault(root(max(blocks)), []).append(joint)
+        found.setdefault(_root(label, max(blocks)), []).append(joint)
     return list(found.values())
+
+
+def _root(label: dict[int, int], block: int) -> int:
+    """What stands for all blocks that are connected with this one."""
+    while label[block] != block:
+        block = label[block]
+    return block
 
 
 def _grow(

@@ -24,7 +24,7 @@ from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_changes, row_velocity
 from mathota_jax.solver.table import EMPTY
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import repeat_worlds, take
 from mathota_jax.spatial.settle import compute_once
 
 STIFF = 16
@@ -53,7 +53,7 @@ def responses(links: mechanism.Links, joint_rows: Sequence[Rows], slots: tuple[i
     """
     count, block_count = len(slots), links.layout.block_count
     worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in joint_rows)))
-    tiled, rows = _side_by_side((links, tuple(joint_rows)), count, worlds)
+    tiled, rows = repeat_worlds((links, tuple(joint_rows)), count, worlds)
     units = jnp.repeat(jnp.eye(count, dtype=links.offset.x.dtype), worlds, axis=1)
     impulse = jnp.zeros((6, block_count, count * worlds), units.dtype)
     for group, unit in zip(rows, _to_tables(rows, slots, units), strict=True):
@@ -159,11 +159,6 @@ def _to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array
 
 def _slot_count(joint_rows: Sequence[Rows]) -> int:
     return sum(int((group.table.order != EMPTY).sum()) for group in joint_rows)
-
-
-def _side_by_side(tree: Any, count: int, worlds: int) -> Any:
-    """Copies of all worlds, one for each row; what worlds share stays so."""
-    return jax.tree.map(lambda x: x if x.shape[-1] < worlds or worlds == 1 else jnp.tile(x, count), tree)
 
 
 def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Array) -> Array:

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mathota_jax.solver import dense
 from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import store
 
@@ -334,15 +335,5 @@ def _solve_roots(inertia: tuple[Array, ...], force: Pair) -> Pair:
     upper = jnp.concatenate([linear, mixed], axis=2)
     lower = jnp.concatenate([jnp.swapaxes(mixed, 1, 2), angular], axis=2)
     right = jnp.concatenate(force, axis=1)[:, :, None]
-    rows = jnp.concatenate([jnp.concatenate([upper, lower], axis=1), right], axis=2)
-
-    def pivot(rows: Array, place: Array) -> tuple[Array, None]:
-        # Gauss-Jordan: positive definite, and so without exchanges.
-        row = lax.dynamic_index_in_dim(rows, place, axis=1)
-        row = row / lax.dynamic_index_in_dim(row, place, axis=2)
-        others = lax.dynamic_index_in_dim(rows, place, axis=2)
-        is_pivot = (jnp.arange(6) == place)[None, :, None, None]
-        return jnp.where(is_pivot, row, rows - others * row), None
-
-    rows, _ = lax.scan(pivot, rows, jnp.arange(6))
-    return rows[:, :3, 6], rows[:, 3:, 6]
+    motion = dense.solve(jnp.concatenate([upper, lower], axis=1), right)[:, :, 0]
+    return motion[:, :3], motion[:, 3:]

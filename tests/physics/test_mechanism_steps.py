@@ -252,13 +252,13 @@ def test_a_loop_with_too_many_joints_stays_finite(precision, case, gate):
     rise = np.asarray(record["energy"], float) - float(energy(model, state))
     gate("energy gained / that of the fall", np.maximum(rise, 0.0) / (GRAVITY * 3 * 2.0), 0.02)
     if not contradicts:
-        gate("gap [m]", np.asarray(record["gap"]), 1e-2)
+        gate("gap [m]", np.asarray(record["gap"]), 1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sleep", [False, True])
 def test_a_loop_beside_a_tree_leaves_it_exact(precision, sleep, gate):
-    """A four-bar linkage and a chain of four in one scene: the chain is a mechanism, the loop is swept."""
+    """A four-bar linkage and a chain of four in one scene."""
     builder = SceneBuilder(gravity=DOWN)
     ground = builder.add_body(Sphere(0.02), static=True, collides=False)
     places = [((0, 0.5, 0), (0.02, 0.5, 0.02)), ((0.5, 1, 0), (0.5, 0.02, 0.02)), ((1, 0.5, 0), (0.02, 0.5, 0.02))]
@@ -278,7 +278,7 @@ def test_a_loop_beside_a_tree_leaves_it_exact(precision, sleep, gate):
         lambda model, state: {"gap": joint_gaps(model, state).translation, "energy": energy(model, state)},
     )  # fmt: skip
     gap = np.asarray(record["gap"], float)[:, 0]
-    gate("gap of the loop [m]", gap[:, :4], 1e-2)
+    gate("gap of the loop [m]", gap[:, :4], 1e-5)
     gate("gap of the chain / link", gap[:, 4:] / 0.25, 1e-5)
     rise = np.asarray(record["energy"], float) - float(energy(model, state))
     gate("energy gained / that of the fall", np.maximum(rise, 0.0) / (GRAVITY * 3 * 2.0), 0.02)
