@@ -434,7 +434,7 @@ CASES: tuple[Case, ...] = (
     _cubes(1e3, FINER, ("converged",), "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails"),
     _dragged(1.0, FINER, ()),
     _dragged(1e2, FINER, ()),
-    _dragged(1e3, FINER, ()),
+    _dragged(1e3, FINER, ("converged",)),
     _loaded_pyramid(100.0),
     _loaded_pyramid(300.0),
     _two_small(400, 10.0, ()),
@@ -452,7 +452,7 @@ CASES: tuple[Case, ...] = (
     _stack(10, ("soft_step", "converged"), "PyBullet collapses (10 iterations), leans 0.017 (50); MuJoCo dips 0.0014"),
     _stack(20, ("soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),
     _stack(40, ("converged",), "PyBullet collapses; MuJoCo dips 0.0056; soft steps, in theory, 0.011"),
-    _column("spheres", Sphere(0.5), ()),
+    _column("spheres", Sphere(0.5), ("soft_step",)),
     _column("cylinders", Cylinder(0.5, 0.5), ()),
     Case(
         "B4",
@@ -556,7 +556,7 @@ CASES: tuple[Case, ...] = (
         separating,
         {"largest speed [m/s]": 4.5},
         ("pgs", "soft_step"),
-        (),
+        ("pgs", "soft_step"),
         peers="largest speed: PyBullet 39, MuJoCo 102",
     ),
     Case(
@@ -567,7 +567,7 @@ CASES: tuple[Case, ...] = (
         lambda run: pressed(run, 0.5),
         {"largest speed [m/s]": 4.5 + np.sqrt(2 * GRAVITY), "overlap / diameter": 0.1},
         ALL,
-        (),
+        ("pgs",),
         push=Push(growth=(0.0, -1e4, 0.0)),
     ),
     Case(
