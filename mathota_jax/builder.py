@@ -14,6 +14,7 @@ from jax import Array
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.plan import plan_broadphase
 from mathota_jax.constraints.joint_layout import joint_row_count
+from mathota_jax.constraints.warm_start import matches_by_distance
 from mathota_jax.declarations import UNTURNED, Body, boolean, look_up, mass_properties, number
 from mathota_jax.geometry import SHAPES, Compound, Shape
 from mathota_jax.geometry.validation import finite_vector, unit_quaternion
@@ -293,6 +294,7 @@ class SceneBuilder:
             joint_force=joint_force,
             flags=jnp.zeros((), jnp.int32),
             contact_pair=jnp.full(scene.place_count, -1, jnp.int32) if scene.broadphase else None,
+            contact_offset=jnp.zeros_like(contact_force) if matches_by_distance(scene) else None,
             sleep=Sleep(
                 time=_floats(np.zeros(len(bodies))),
                 asleep=jnp.zeros(len(bodies), bool),

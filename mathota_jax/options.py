@@ -39,6 +39,9 @@ class Options:
       baumgarte: share of a joint's position error turned into velocity in a step, where `position_iterations` is 0 and so
         nothing else closes joints. It adds energy, and without bound where joints contradict each other. Guide 9.5.
       warm_start: start the solver from the impulses of the previous step. Guide 7.3 and 12.4.
+      warm_start_match: distance up to which a contact of a pair whose feature is gone passes its impulse to a new one, in
+        inner radii of the smaller moving body, from whose centre places are measured; 0 for none. For round rims and
+        heightfields, where features change although a contact stays; absent in scenes without. Guide 7.3 and 11.3.
       broadphase: "auto": in scenes of up to 20 possible pairs, and for heightfields and planes, each pair has its own
         contact slots; the others are found in every step by the method that suits the size of the scene, and so are pairs
         with planes where shapes would have many points on them (boxes in a bin). "none": every pair has its own slots.
@@ -104,6 +107,7 @@ class Options:
     position_percent: float = 0.8
     baumgarte: float = 0.1
     warm_start: bool = True
+    warm_start_match: float = 0.02
     broadphase: str = "auto"
     pair_capacity: int | None = None
     gradient_iterations: int | None = None
@@ -130,7 +134,7 @@ class Options:
             optional = (name, minimum) in OPTIONAL and value is None
             if not optional and not _is_integer(value, minimum):
                 raise ValueError(f"Options.{name} must be an integer of at least {minimum}, got {value!r}")
-        for name in ("linear_damping", "angular_damping", "slop"):
+        for name in ("linear_damping", "angular_damping", "slop", "warm_start_match"):
             value = getattr(self, name)
             if not (_is_number(value) and value >= 0):
                 raise ValueError(f"Options.{name} must be a finite number of at least 0, got {value!r}")

@@ -64,6 +64,8 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
         flags.append(jnp.where(open_loops, int(Flag.OPEN_LOOP), 0))
     if problem.contacts is not None:
         changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
+        if problem.offsets is not None:
+            changes["contact_offset"] = jnp.stack(problem.offsets, axis=1)
         if problem.contacts.converged is not None or problem.close is not None:
             flags.append(_collision_flags(problem.contacts, problem.close))
         if problem.close is not None:

@@ -12,7 +12,7 @@ from mathota_jax.bodies import Bodies, unpack
 from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.joints.frames import joint_frames
-from mathota_jax.constraints.slots import bodies_of_slots, find_slots, matched_force
+from mathota_jax.constraints.slots import bodies_of_slots, contact_offsets, find_slots, matched_force
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import gather
 from mathota_jax.spatial.safe import safe_sqrt
@@ -56,7 +56,7 @@ class JointGaps:
 def residuals(model: Model, state: State) -> Residuals:
     """The four residuals of the contacts of the last step, without derivative of use.
 
-    The impulses are those of the last step, in the contacts whose pair and feature are the same at the present poses; the
+    The impulses are those of the last step, in the contacts that are the same at the present poses; the
     velocities and normals are the present ones. So a body that turned by an angle in the last step shows terms of the
     order of that angle that are none of the solver's.
 
@@ -99,8 +99,11 @@ class _Slots(NamedTuple):
 def _slots(model: Model, state: State, bodies: Bodies) -> _Slots:
     scene = model.scene
     contacts, close = find_slots(model, bodies, None)
+    offset = contact_offsets(model, bodies, contacts, close)
     return _Slots(
-        contacts, *bodies_of_slots(scene, close), matched_force(scene, contacts, close, state, state.contact_force)
+        contacts,
+        *bodies_of_slots(scene, close),
+        matched_force(scene, contacts, offset, close, state, state.contact_force),
     )
 
 

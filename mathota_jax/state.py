@@ -93,6 +93,9 @@ class State:
       flags: () bits of `Flag`; 0 when all is well.
       contact_pair: (place,) pair that held each place of the compact groups in the last step, ``first * shapes + second``
         in the numbering of the broadphase, -1 for none; None in scenes without broadphase.
+      contact_offset: (slot, 3) where each contact was in the last step, from the centre of mass of its smaller moving body,
+        in inner radii of that body along the axes of the world; None unless contacts are matched by distance
+        (`Options.warm_start_match`).
       sleep: timers of the sleeping system; None unless `Options.sleep`.
       end_forces: from which the small steps start; None unless ``Options.solver`` is "soft_step".
     """
@@ -108,6 +111,7 @@ class State:
     joint_force: Array
     flags: Array
     contact_pair: Array | None = None
+    contact_offset: Array | None = None
     sleep: Sleep | None = None
     end_forces: EndForces | None = None
 

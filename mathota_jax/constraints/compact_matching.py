@@ -8,9 +8,8 @@ from jax import Array
 
 from mathota_jax.collision.broadphase import PairList
 from mathota_jax.collision.broadphase.ranges import lower_bound
-from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.constraints.compact import NO_PAIR, ClosePairs, filled, pair_key
-from mathota_jax.constraints.warm_start import matched_points
+from mathota_jax.constraints.warm_start import NO_FEATURE, Marks, is_steady, matched_points
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import gather, in_every_world, take
@@ -24,13 +23,13 @@ def pair_keys(scene: Scene, close: ClosePairs) -> Array:
 
 
 def matched_force(
-    scene: Scene, close: ClosePairs, contacts: ContactSet, force: Vec3, feature: Array, pair: Array
+    scene: Scene, close: ClosePairs, old: Marks, new: Marks, active: Array, force: Vec3, pair: Array
 ) -> list[Vec3]:
-    """Forces of the last step in the slots where their pairs and features are now, a vector for each compact group.
+    """Forces of the last step in the slots where their contacts are now, a vector for each compact group.
 
     Args:
-      scene, close, contacts: static structure, and what is close in this step; all slots.
-      force, feature, pair: what the state keeps: (slot, world), (slot, world) and (place, world).
+      scene, close: static structure, and what is close in this step.
+      old, new, active, force, pair: of all slots (slot, world), and what the state keeps (place, world).
     """
     assert scene.broadphase is not None
     one_by_one = scene.broadphase.one_by_one
@@ -38,21 +37,27 @@ def matched_force(
     parts, slot = [], scene.static_slot_count
     for number, (group, p) in enumerate(zip(scene.compact_groups, close.groups, strict=True)):
         rows = range(slot, slot + group.slot_count)
-        shape = (group.place_count, group.point_count, -1)
-        found = [x.reshape(shape) for x in take((contacts.feature, contacts.active), rows)]
-        old = jax.tree.map(lambda x, shape=shape: x.reshape(shape), take((feature, force), rows))
+        shape, steady = (group.place_count, group.point_count, -1), is_steady(group)
+        if steady:
+            old_marks, new_marks = old._replace(offset=None), new._replace(offset=None)
+        else:
+            old_marks, new_marks = old, new
+        taken = take(((new_marks, active), (old_marks, force)), rows)
+        now, then = jax.tree.map(lambda x, shape=shape: x.reshape(shape), taken)
 
-        def matched(places: tuple, number: int = number, old: tuple[Array, Vec3] = old) -> Vec3:
-            where, new_feature, active = places
+        def matched(
+            places: tuple, number: int = number, then: tuple[Marks, Vec3] = then, steady: bool = steady
+        ) -> Vec3:
+            where, (marks, present) = places
             source, known = _known_places(scene, pair, number, *where) if one_by_one else where
-            old_feature, *old_force = [gather(x, source) for x in jax.tree.leaves(old)]
-            old_feature = jnp.where(known[:, None], old_feature, NO_PAIR)
-            return matched_points(old_feature, new_feature, active, Vec3(*old_force))
+            kept, old_force = jax.tree.map(lambda x: gather(x, source), then)
+            kept = kept._replace(feature=jnp.where(known[:, None], kept.feature, NO_FEATURE))
+            return matched_points(kept, marks, present, old_force, scene.options.warm_start_match, steady)
 
         if one_by_one:
-            parts.append(map_filled(matched, ((pair_key(scene, *p.pair), p.active), *found), filled(p)))
+            parts.append(map_filled(matched, ((pair_key(scene, *p.pair), p.active), now), filled(p)))
         else:
-            parts.append(matched((sources[number], *found)))
+            parts.append(matched((sources[number], now)))
         slot += group.slot_count
     return parts
 
@@ -73,7 +78,7 @@ def carried(scene: Scene, close: ClosePairs, force: Array, feature: Array, pair:
         slots = slots.reshape(group.slot_count, -1)
         known = jnp.repeat(known, group.point_count, axis=0)
         forces.append(jnp.where(known[:, None], gather(force, slots), 0.0))
-        features.append(jnp.where(known, gather(feature, slots), NO_PAIR))
+        features.append(jnp.where(known, gather(feature, slots), NO_FEATURE))
         slot += group.slot_count
     worlds = max(values.shape[-1] for values in (*forces, *features))
 

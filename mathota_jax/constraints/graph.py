@@ -125,6 +125,9 @@ def keep_forces(
         slot_quiet = gather(quiet, first) & gather(quiet, second)
         feature = _in_present_slots(scene, close, old, old.contact_force)[1]
         changes["contact_feature"] = jnp.where(slot_quiet, feature, new.contact_feature)
+        if old.contact_offset is not None and new.contact_offset is not None:
+            offset = _in_present_slots(scene, close, old, old.contact_offset)[0]
+            changes["contact_offset"] = jnp.where(slot_quiet[:, None], offset, new.contact_offset)
 
     def kept(before: Any, after: Any) -> dict[str, Array]:
         found = {}

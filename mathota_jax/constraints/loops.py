@@ -20,7 +20,8 @@ OPEN = 0.1
 YIELDING = 30.0
 """How far a row that is as open as counts as open gives way, over the motion that its two bodies alone allow.
 
-A bridge as long as its span opens by 0.017 of a link with 30, by 0.029 with 1, by 0.028 with 100.
+Chosen on one scene, a bridge of 160 links as long as its span, in nine runs: in 5 s it opens by 0.022 of a link with 10, by
+0.017 with 30, by 0.028 with 100.
 """
 
 

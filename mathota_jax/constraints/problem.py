@@ -25,7 +25,7 @@ from mathota_jax.constraints import (
 )
 from mathota_jax.constraints.contact_force import warm_start_impulse
 from mathota_jax.constraints.decoupling import Decoupling
-from mathota_jax.constraints.slots import matched_force, own_contacts
+from mathota_jax.constraints.slots import contact_offsets, matched_force, own_contacts
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.soft_laws import PositionError
@@ -45,7 +45,8 @@ class Problem(NamedTuple):
     """Constraints of one step: joints first, so that contacts, which must not be violated, have the last word.
 
     `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of
-    all groups, for the small steps alone; `decouplings` are those of the joint rows, none where these are as they were.
+    all groups, for the small steps alone; `decouplings` are those of the joint rows, none where these are as they were;
+    `offsets` are where contacts are matched by distance.
     """
 
     joints: joint_rows.JointRows | None
@@ -57,6 +58,7 @@ class Problem(NamedTuple):
     close: compact.ClosePairs | None
     errors: tuple[PositionError, ...] = ()
     decouplings: tuple[Decoupling, ...] = ()
+    offsets: Vec3 | None = None
 
     @property
     def of_joint_rows(self) -> tuple[Decoupling | None, ...]:
@@ -121,7 +123,7 @@ def constrain(
                 substep_rows.joint_error(scene, rows, model, joint_motion, how)
                 for rows, how in zip(tables, decouplings, strict=True)
             )
-    contacts, contact_rows, close = None, [], None
+    contacts, contact_rows, close, offsets = None, [], None, None
     if scene.slot_count:
         found = own_contacts(model, bodies)
         if scene.options.continuous:
@@ -138,9 +140,10 @@ def constrain(
             sets, more = compact.contacts_and_rows(model, bodies, close, motion)
             found, contact_rows = found + sets, contact_rows + more
         contacts = join_contacts(found)
+        offsets = contact_offsets(model, bodies, contacts, close)
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
-    return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings)
+    return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings, offsets)
 
 
 def starting_impulses(
@@ -155,7 +158,7 @@ def starting_impulses(
     last = state if state.end_forces is None else state.end_forces
     if problem.contacts is None:
         return _impulses(model, problem, last.joint_force, None), None
-    force = matched_force(model.scene, problem.contacts, problem.close, state, last.contact_force)
+    force = matched_force(model.scene, problem.contacts, problem.offsets, problem.close, state, last.contact_force)
     start = _impulses(model, problem, last.joint_force, force)
     if model.scene.options.solver != "soft_step":
         return warm_start.plausible(problem.rows, inertia, velocity, start)

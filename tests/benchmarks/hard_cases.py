@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mathota_jax import Options, step
+from mathota_jax import Cylinder, Options, Sphere, step
 from tests.benchmarks import hard_scenes
 from tests.benchmarks.hard_scenes import ROLLING_PUSH, Built, bridge_gaps, joint_gaps
 from tests.scenes import GRAVITY, box_stack
@@ -52,6 +52,30 @@ class Run(NamedTuple):
 Measure = Callable[[Run], dict[str, float]]
 
 
+class Push(NamedTuple):
+    """A force on one body.
+
+    Attributes:
+      force: [N] all the time.
+      growth: [N] more in each step.
+      body: on which it acts.
+      point: from its centre of mass [m], along the axes of the world.
+    """
+
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    growth: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    body: int = 1
+    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def loads(self, step_count: int) -> np.ndarray:
+        """(step, 6) force and torque of each step."""
+        force = np.asarray(self.force) + np.arange(1, step_count + 1)[:, None] * np.asarray(self.growth)
+        return np.concatenate([force, np.cross(self.point, force)], axis=1)
+
+
+NO_PUSH = Push()
+
+
 @dataclasses.dataclass(frozen=True)
 class Case:
     """One scene with its measurement.
@@ -67,7 +91,7 @@ class Case:
       tested: those that are to carry the scene (docs/solvers.md), and must meet the gates; none where that is not known yet.
       dt: [s].
       settings: further options.
-      force: constant force [N] on body 1.
+      push: force from outside.
       peers: published figures for the same measurement.
     """
 
@@ -81,7 +105,7 @@ class Case:
     tested: tuple[str, ...]
     dt: float = 1 / 60
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    force: tuple[float, float, float] | None = None
+    push: Push = NO_PUSH
     peers: str = ""
 
     @property
@@ -95,22 +119,24 @@ class Case:
         return self.build(Options(**{"dt": self.dt, **undamped, **self.settings, **TIERS[tier]}))
 
 
-def simulate(model: Any, state: Any, force: Any, step_count: int) -> tuple[Any, Any]:
-    """The final state and the motion after each step."""
+def simulate(model: Any, state: Any, loads: Any, pushed: int) -> tuple[Any, Any]:
+    """The final state and the motion after each step, with `loads` (step, 6) on the body `pushed`."""
 
-    def body(current: Any, _: None) -> tuple[Any, Any]:
-        new = step(model, dataclasses.replace(current, applied_force=current.applied_force.at[1].add(force)))
+    def body(current: Any, load: Any) -> tuple[Any, Any]:
+        force = current.applied_force.at[pushed].add(load[:3])
+        torque = current.applied_torque.at[pushed].add(load[3:])
+        new = step(model, dataclasses.replace(current, applied_force=force, applied_torque=torque))
         return new, (new.position, new.orientation, new.velocity, new.angular_velocity)
 
-    return jax.lax.scan(body, state, None, length=step_count)
+    return jax.lax.scan(body, state, loads)
 
 
 def record(case: Case, tier: str, seconds: float | None = None) -> tuple[Run, int]:
     """The run of a case, and the flags of the final state; shorter if `seconds` says so."""
     model, state = case.built(tier)
     steps = round((case.seconds if seconds is None else seconds) / case.dt)
-    force = jnp.asarray(case.force or (0.0, 0.0, 0.0), state.position.dtype)
-    final, motion = jax.jit(simulate, static_argnums=3)(model, state, force, steps)
+    loads = jnp.asarray(case.push.loads(steps), state.position.dtype)
+    final, motion = jax.jit(simulate, static_argnums=3)(model, state, loads, case.push.body)
     return as_run(case, model, state, motion), int(final.flags)
 
 
@@ -206,7 +232,26 @@ def bridging(run: Run, links: int) -> dict[str, float]:
 
 def separating(run: Run) -> dict[str, float]:
     """Speeds of bodies that start with an overlap."""
-    return {"largest speed [m/s]": float(run.speed.max()), "speed at the end [m/s]": float(run.speed[-1].max())}
+    place = run.position[-1, 1:]
+    apart = np.linalg.norm(place[:, None] - place[None], axis=-1)[np.triu_indices(len(place), 1)]
+    return {
+        "largest speed [m/s]": float(run.speed.max()),
+        "speed at the end [m/s]": float(run.speed[-1].max()),
+        "nearest centres at the end [m]": float(apart.min()),
+    }
+
+
+def pressed(run: Run, radius: float) -> dict[str, float]:
+    """Balls on y = 0 under a plank, body 1: overlap, how far they are squeezed out, and the largest speed."""
+    balls = run.position[:, 2:]
+    underside = run.position[:, 1:2, 1] - 0.25
+    overlap = np.maximum(radius - balls[..., 1], balls[..., 1] + radius - underside)
+    aside = np.linalg.norm((run.position - run.start)[:, 2:, [0, 2]], axis=-1)
+    return {
+        "overlap / diameter": float(overlap.max() / (2 * radius)),
+        "sideways / diameter": float(aside.max() / (2 * radius)),
+        "largest speed [m/s]": float(run.speed.max()),
+    }
 
 
 def passing(run: Run, middle: float, half: float, top: float) -> dict[str, float]:
@@ -240,7 +285,7 @@ def _rolling(name: str, along: np.ndarray, peers: str) -> Case:
         ("pgs", "pgs, 40 sweeps", "converged"),
         ("pgs", "converged"),
         dt=1e-3,
-        force=tuple(ROLLING_PUSH * along),
+        push=Push(tuple(ROLLING_PUSH * along)),
         peers=f"10 / 40 iterations: {peers}",
     )
 
@@ -290,6 +335,21 @@ def _cubes(ratio: float, tiers: tuple[str, ...], tested: tuple[str, ...], peers:
     )
 
 
+def _dragged(ratio: float, tiers: tuple[str, ...], tested: tuple[str, ...]) -> Case:
+    return Case(
+        "B1",
+        f"cube of {ratio:g} times the mass on a cube, pulled",
+        lambda options: hard_scenes.two_cubes(ratio, options),
+        2.0,
+        lambda run: standing(run, 0.2),
+        REST,
+        tiers,
+        tested,
+        # Half of what its friction holds; at its lower face, since pulled by its centre a heavy one tips the pair over.
+        push=Push((0.5 * 0.9 * ratio * GRAVITY, 0.0, 0.0), body=2, point=(0.0, -0.1, 0.0)),
+    )
+
+
 def _loaded_pyramid(ratio: float) -> Case:
     return Case(
         "B2a",
@@ -330,6 +390,19 @@ def _stack(count: int, tested: tuple[str, ...], peers: str) -> Case:
     )
 
 
+def _column(name: str, shape: Any, tested: tuple[str, ...]) -> Case:
+    return Case(
+        "B3",
+        f"column of 30 {name}",
+        lambda options: hard_scenes.column(30, shape, options),
+        10.0,
+        lambda run: standing(run, 30.0),
+        REST,
+        ALL,
+        tested,
+    )
+
+
 def _card_house(dt: float, tiers: tuple[str, ...], tested: tuple[str, ...]) -> Case:
     return Case(
         "B5a",
@@ -359,6 +432,9 @@ CASES: tuple[Case, ...] = (
     _cubes(1.0, FINER, ("pgs", "soft_step", "converged"), ""),
     _cubes(1e2, FINER, ("converged",), "dip: PyBullet (50 iterations) 0.021, MuJoCo 0.05"),
     _cubes(1e3, FINER, ("converged",), "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails"),
+    _dragged(1.0, FINER, ()),
+    _dragged(1e2, FINER, ()),
+    _dragged(1e3, FINER, ("converged",)),
     _loaded_pyramid(100.0),
     _loaded_pyramid(300.0),
     _two_small(400, 10.0, ()),
@@ -376,6 +452,8 @@ CASES: tuple[Case, ...] = (
     _stack(10, ("soft_step", "converged"), "PyBullet collapses (10 iterations), leans 0.017 (50); MuJoCo dips 0.0014"),
     _stack(20, ("soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),
     _stack(40, ("converged",), "PyBullet collapses; MuJoCo dips 0.0056; soft steps, in theory, 0.011"),
+    _column("spheres", Sphere(0.5), ("soft_step",)),
+    _column("cylinders", Cylinder(0.5, 0.5), ()),
     Case(
         "B4",
         "wall of 210 cubes",
@@ -458,6 +536,39 @@ CASES: tuple[Case, ...] = (
         ("pgs", "soft_step"),
         ("pgs", "soft_step"),
         peers="largest speed: PyBullet 3.4 (1/60), 15.3 (1/240); MuJoCo 13.5, 20.8",
+    ),
+    Case(
+        "B10b",
+        "20 cubes within 1e-4 of one point",
+        lambda options: hard_scenes.at_one_point(1e-4, options),
+        5.0,
+        separating,
+        {"largest speed [m/s]": 4.5},
+        ("pgs", "soft_step"),
+        ("pgs", "soft_step"),
+        peers="largest speed: PyBullet 9.8, MuJoCo 50",
+    ),
+    Case(
+        "B10c",
+        "20 cubes at one point",
+        lambda options: hard_scenes.at_one_point(0.0, options),
+        5.0,
+        separating,
+        {"largest speed [m/s]": 4.5},
+        ("pgs", "soft_step"),
+        ("pgs", "soft_step"),
+        peers="largest speed: PyBullet 39, MuJoCo 102",
+    ),
+    Case(
+        "B10d",
+        "8 x 8 balls under a plank pressed by up to 5e6 N",
+        hard_scenes.compression,
+        500 / 60,
+        lambda run: pressed(run, 0.5),
+        {"largest speed [m/s]": 4.5 + np.sqrt(2 * GRAVITY), "overlap / diameter": 0.1},
+        ALL,
+        ("pgs",),
+        push=Push(growth=(0.0, -1e4, 0.0)),
     ),
     Case(
         "B12b",

@@ -37,16 +37,16 @@ steps (B15) `test_bad_worlds.py`, random worlds `test_fuzz.py`.
 def measured(case: Case, tier: str, programs: dict[Any, Any]) -> dict[str, Any]:
     """Figures of one run in the present precision; `programs` keeps those of equal scenes, with the compile time."""
     model, state = case.built(tier)
-    force = jnp.asarray(case.force or (0.0, 0.0, 0.0), state.position.dtype)
-    steps = round(case.seconds / case.dt)
-    key = (jax.tree.structure((model, state)), steps)
+    steps, pushed = round(case.seconds / case.dt), case.push.body
+    loads = jnp.asarray(case.push.loads(steps), state.position.dtype)
+    key = (jax.tree.structure((model, state)), steps, pushed)
     if key not in programs:
         start = time.process_time()
-        compiled = jax.jit(simulate, static_argnums=3).lower(model, state, force, steps).compile()
+        compiled = jax.jit(simulate, static_argnums=3).lower(model, state, loads, pushed).compile()
         programs[key] = compiled, time.process_time() - start
     compiled, compile_time = programs[key]
     ready = time.process_time()
-    final, motion = jax.block_until_ready(compiled(model, state, force))
+    final, motion = jax.block_until_ready(compiled(model, state, loads))
     end = time.process_time()
     values = case.measure(as_run(case, model, state, motion))
     return {

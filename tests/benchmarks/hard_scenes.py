@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Sphere
+from mathota_jax.geometry import Shape
 from tests.scenes import DOWN, axis_angle, rotation_matrix
 
 Built = tuple[Any, Any]
@@ -99,6 +100,15 @@ def crossed_sticks(options: Options) -> Built:
 # Stacks (Box2D, PEEL) ------------------------------------------------------------------------------------------------
 
 
+def column(count: int, shape: Shape, options: Options) -> Built:
+    """B3: bodies 1 m high, exactly on one another."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.6)
+    for level in range(count):
+        builder.add_body(shape, density=1.0, position=(0.0, 0.5 + level, 0.0), friction=0.6)
+    return builder.build(options)
+
+
 def wall(base: int, options: Options) -> Built:
     """B4: rows of touching cubes of 1 m, each row one shorter."""
     builder = SceneBuilder(gravity=DOWN)
@@ -151,6 +161,28 @@ def overlapping_pyramid(options: Options) -> Built:
         for column in range(4 - row):
             place = (0.75 * (column + 0.5 * row), 0.5 + 0.75 * row, 0.0)
             builder.add_body(Box((0.5, 0.5, 0.5)), density=1.0, position=place, friction=0.6)
+    return builder.build(options)
+
+
+def at_one_point(spread: float, options: Options) -> Built:
+    """B10b and c: 20 cubes of 1 m within `spread` of one point, without gravity."""
+    offsets = np.random.default_rng(0).uniform(-spread, spread, (20, 3))
+    builder = SceneBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_body(Sphere(0.1), static=True, position=(0.0, -100.0, 0.0), collides=False)
+    for place in offsets:
+        builder.add_body(Box((0.5, 0.5, 0.5)), density=1.0, position=place, friction=0.6)
+    return builder.build(options)
+
+
+def compression(options: Options) -> Built:
+    """B10d: a plank of 9 x 0.5 x 9 m, body 1, on 64 balls of 1 m on the ground, all of density 1."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.6)
+    builder.add_body(Box((4.5, 0.25, 4.5)), density=1.0, position=(0.0, 1.25, 0.0), friction=0.6)
+    for row in range(8):
+        for column in range(8):
+            place = (1.1 * (row - 3.5), 0.5, 1.1 * (column - 3.5))
+            builder.add_body(Sphere(0.5), density=1.0, position=place, friction=0.6)
     return builder.build(options)
 
 

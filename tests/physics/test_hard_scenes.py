@@ -12,7 +12,7 @@ import pytest
 
 from mathota_jax import Box, Flag, Sphere, time_of_impact
 from tests.benchmarks import hard_scenes
-from tests.benchmarks.hard_cases import CASES, energy_of_balls, overlap_of_balls, record
+from tests.benchmarks.hard_cases import CASES, NO_PUSH, energy_of_balls, overlap_of_balls, record
 from tests.marks import QUICK_AND_SLOW_PRECISION
 
 EVERY = [pytest.param(case, tier, id=f"{case.name}-{tier}") for case in CASES for tier in case.tested]
@@ -52,7 +52,7 @@ def test_small_block_of_balls(precision, restitution, gate):
     """A3 and A4 with 27 balls for 2 s: the overlap of RaiSim, and no energy from nothing."""
     dt, lowest = 1 / 240, 0.101 + restitution
     case = dataclasses.replace(
-        CASES[0], force=None, dt=dt,
+        CASES[0], push=NO_PUSH, dt=dt,
         build=lambda options: hard_scenes.block_of_balls(options, 3, lowest, restitution),
     )  # fmt: skip
     run, flags = record(case, "pgs", 2.0)

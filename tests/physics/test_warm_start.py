@@ -10,8 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, step
-from tests.scenes import DOWN, advance, axis_angle, motion, record_worlds, repeat, undamped, with_dt
+from mathota_jax import Box, Cylinder, Options, Plane, SceneBuilder, Sphere, step
+from tests.scenes import (
+    DOWN,
+    GRAVITY,
+    advance,
+    axis_angle,
+    body_on_plane,
+    motion,
+    record_worlds,
+    repeat,
+    undamped,
+    with_dt,
+)
 
 
 def pile(order=(0, 1, 2)):
@@ -108,3 +119,24 @@ def test_order_of_the_bodies_does_not_matter(precision, gate):
         final = advance(model, state, 120)
         results.append(np.asarray(final.position, dtype=float)[1:][np.argsort(order)])
     gate("difference of the positions [m]", results[0] - results[1], 1e-4)
+
+
+def rolling(match):
+    """A cylinder that rolls at 2 m/s, a third of its radius a step: its rim has four arcs, which pass under it in turn."""
+    return body_on_plane(
+        Cylinder(0.1, 0.2), position=(0, 0.1, 0), orientation=axis_angle((1, 0, 0), np.pi / 2),
+        velocity=(2.0, 0, 0), angular_velocity=(0, 0, -20.0),
+        options=undamped(dt=1 / 60, velocity_iterations=4, warm_start_match=match),
+    )  # fmt: skip
+
+
+def test_a_rolling_cylinder_keeps_its_contacts(precision, gate):
+    """What bears it is half its weight at each end in every step; four sweeps miss that by 14 % from a cold start."""
+    error = {}
+    for match in (0.0, Options().warm_start_match):
+        model, state = rolling(match)
+        _, record = record_worlds(repeat(model, 1), repeat(state, 1), 120, lambda model, state: state.contact_force)
+        held = np.asarray(record, float)[20:, 0, :, 1]
+        error[match] = np.abs(np.sort(held, axis=1)[:, 2:] / (0.5 * GRAVITY) - 1).max()
+    gate("force at an end / half the weight - 1", error[Options().warm_start_match], 1e-4)
+    assert error[0.0] > 0.01, "features alone lose it"

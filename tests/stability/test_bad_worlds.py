@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mathota_jax import Box, Flag, Hinge, Plane, SceneBuilder, energy
+from mathota_jax import Box, Flag, Hinge, Plane, SceneBuilder, energy, step
 from tests.scenes import DOWN, advance_worlds, repeat, undamped
 
 WORLDS, BAD = 8, 3
@@ -101,6 +101,27 @@ def test_a_bad_world_leaves_the_others_alone(precision):
             np.testing.assert_array_equal(np.asarray(a)[HEALTHY], np.asarray(b)[HEALTHY], err_msg=where)
         flagged = bool(np.asarray(mixed.flags)[BAD] & Flag.NON_FINITE)
         assert flagged or finite(mixed)[BAD], f"{name}: not finite, and not flagged"
+
+
+@jax.jit
+def slopes(models, states):
+    """Of where the bodies are after a step, by the velocities before it and the masses, in each world."""
+
+    def places(model, state, velocity, mass):
+        after = step(dataclasses.replace(model, mass=mass), dataclasses.replace(state, velocity=velocity))
+        return jnp.sum(after.position)
+
+    return jax.vmap(jax.grad(places, (2, 3)))(models, states, states.velocity, models.mass)
+
+
+def test_a_bad_world_leaves_the_derivatives_of_the_others_alone():
+    """The same to the bit, and finite."""
+    models, states = batch()
+    clean = [np.asarray(slope)[HEALTHY] for slope in slopes(models, states)]
+    assert all(np.isfinite(slope).all() and slope.any() for slope in clean)
+    for name, change in BAD_WORLDS.items():
+        for slope, mixed in zip(clean, slopes(*change(models, states)), strict=True):
+            np.testing.assert_array_equal(slope, np.asarray(mixed)[HEALTHY], err_msg=name)
 
 
 def test_time_steps_out_of_all_proportion(precision, gate):

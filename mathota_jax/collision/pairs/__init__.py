@@ -45,6 +45,9 @@ class DistanceFunction(Protocol):
 CONVEX = ("capsule", "box", "cylinder", "cone", "polyhedron")
 """Kinds that meet each other by their support functions where no closed form is registered."""
 
+ROUND_RIMMED = {"cylinder", "cone"}
+"""Kinds with a round rim."""
+
 CLOSED_FORM = "closed form"
 SEPARATING_AXES = "separating axes, clipping"
 SEARCHED_AXES = "GJK or separating axes, clipping"
@@ -58,25 +61,29 @@ class Pair(NamedTuple):
     """How to test a pair of kinds, how many contact points the answer has, and by which method it is found.
 
     `distance` is given where the deepest point of the manifold is not at the signed distance, or takes longer to find.
+    `steady` is whether a point that stays where it is on both bodies, or rolls, keeps its feature: on round rims, the arcs
+    of which are numbered, and from cell to cell of a heightfield it does not.
     """
 
     function: PairFunction
     point_count: int
     method: str = CLOSED_FORM
     distance: DistanceFunction | None = None
+    steady: bool = True
 
 
 def _convex(kind_a: str, kind_b: str) -> Pair:
     method = SEARCHED_AXES if are_polytopes((kind_a, kind_b)) else SEARCHED_CURVED
-    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), method, convex_nearest(kind_a, kind_b))
+    nearest, steady = convex_nearest(kind_a, kind_b), not {kind_a, kind_b} & ROUND_RIMMED
+    return Pair(convex_pair(kind_a, kind_b), convex_point_count(kind_a, kind_b), method, nearest, steady)
 
 
 PAIRS: dict[tuple[str, str], Pair] = {
     ("plane", "sphere"): Pair(plane_sphere, 1),
     ("plane", "capsule"): Pair(plane_capsule, 2),
     ("plane", "box"): Pair(plane_box, 4),
-    ("plane", "cylinder"): Pair(plane_cylinder, 4),
-    ("plane", "cone"): Pair(plane_cone, 4),
+    ("plane", "cylinder"): Pair(plane_cylinder, 4, steady=False),
+    ("plane", "cone"): Pair(plane_cone, 4, steady=False),
     ("plane", "polyhedron"): Pair(plane_polyhedron, 4),
     ("sphere", "sphere"): Pair(sphere_sphere, 1),
     ("sphere", "capsule"): Pair(sphere_capsule, 1),
@@ -89,7 +96,7 @@ PAIRS: dict[tuple[str, str], Pair] = {
     ("box", "box"): Pair(box_box, 4, SEPARATING_AXES, box_distance),
 }
 PAIRS |= {
-    (kind.name, "heightfield"): Pair(heightfield_pair(kind), HEIGHTFIELD_POINTS, LOCAL_CELLS)
+    (kind.name, "heightfield"): Pair(heightfield_pair(kind), HEIGHTFIELD_POINTS, LOCAL_CELLS, steady=False)
     for kind in HEIGHTFIELD_KINDS
 }
 PAIRS |= {(a, b): _convex(a, b) for k, a in enumerate(CONVEX) for b in CONVEX[k:] if (a, b) not in PAIRS}
