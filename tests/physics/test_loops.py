@@ -2,13 +2,14 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from mathota_jax import BallAndSocket, Box, Hinge, SceneBuilder, Sphere, joint_forces, joint_gaps, step
+from mathota_jax import BallAndSocket, Box, Hinge, Plane, SceneBuilder, Sphere, joint_forces, joint_gaps, rollout, step
 from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, GRAVITY, advance_worlds, axis_angle, invariants, motion, record_worlds, repeat, undamped
 
@@ -49,8 +50,8 @@ def slopes(angle, step=1e-3):
     return [(4 * near - far) / 3 for near, far in zip(difference(step), difference(2 * step), strict=True)]
 
 
-def linkage(angle, rate, **options):
-    """Bars of 1 kg, the crank on body 0."""
+def linkage(angle, rate, crank=None, **options):
+    """Bars of 1 kg, the crank on body 0 by a hinge with what `crank` adds, and with a motor if it adds anything."""
     builder = SceneBuilder(gravity=DOWN)
     builder.add_body(Sphere(0.02), static=True, collides=False)
     centre, turn = poses(angle)
@@ -61,7 +62,9 @@ def linkage(angle, rate, **options):
         )  # fmt: skip
     first, second = corners(angle)
     for parent, child, place in ((0, 1, (0, 0)), (1, 2, first), (2, 3, second), (3, 0, (BASE, 0))):
-        builder.add_joint(Hinge(parent, child, (*place, 0.0), ACROSS))
+        hinge = builder.add_joint(Hinge(parent, child, (*place, 0.0), ACROSS, **(crank or {} if child == 1 else {})))
+        if crank and child == 1:
+            builder.add_motor(hinge, kind="velocity", limit=100.0)
     model, state = builder.build(undamped(**options))
     by_centre, by_turn = slopes(angle)
     return model, dataclasses.replace(
@@ -112,6 +115,46 @@ def test_four_bar_linkage(precision, solver, gate):
     first = float(0.5 * inertia(angle) * rate**2 + GRAVITY * poses(angle)[0][:, 1].sum())
     gate("energy gained / that of the fall", max(0.0, energy.max() - first) / (GRAVITY * 3 * CRANK), 2e-3)
     gate("energy lost / that of the fall", max(0.0, first - energy.min()) / (GRAVITY * 3 * CRANK), 1e-2)
+
+
+@pytest.mark.parametrize("solver", SOLVERS[:2])
+def test_a_driven_linkage_turns_as_told_and_stops_at_its_stop(solver, gate):
+    """A motor drives the crank against gravity and dry friction, 0.3 rad to a stop."""
+    angle, rate, stop, dt = 2.0, 1.0, 0.3, 1 / 240
+    model, state = linkage(angle, rate, {"limits": (-1.0, stop), "friction": 1.0}, dt=dt, solver=solver)
+    _, trajectory = rollout(model, state, jnp.full((120, 1), rate))
+    turned = 2 * np.arctan2(trajectory.orientation[:, 1, 3], trajectory.orientation[:, 1, 0]) - angle
+    told = np.minimum(rate * dt * np.arange(1, 121), stop)
+    gate("angle of the crank [rad]", turned - told, 1e-4)
+    gate("beyond the stop [rad]", np.maximum(turned - stop, 0.0), 1e-5)
+    gap = jax.vmap(lambda state: joint_gaps(model, state).translation)(trajectory)
+    gate("gap / crank", np.asarray(gap) / CRANK, 1e-5)
+    assert not trajectory.flags.any()
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_frame_slides_over_a_plane(solver, gate):
+    """Four hinged bars lie on a plane and slide until friction stops them: contacts beside a loop."""
+    friction, speed, half = 0.4, 1.0, 0.05
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=friction)
+    corners = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+    for place, (x, z) in enumerate(0.5 * (corners + np.roll(corners, -1, axis=0))):
+        builder.add_body(
+            Box((0.4, half, half)), mass=1.0, position=(x, half, z), friction=friction, velocity=(speed, 0, 0),
+            orientation=axis_angle((0, 1, 0), place * np.pi / 2),
+        )  # fmt: skip
+    for place, (x, z) in enumerate(corners):
+        builder.add_joint(Hinge((place - 1) % 4 + 1, place + 1, (x, half, z), (0, 1, 0)))
+    model, state = builder.build(undamped(dt=1 / 240, solver=solver))
+    final, trajectory = rollout(model, state, 96)
+    moved = np.asarray(final.position[1:] - state.position[1:])
+    gate("distance / v^2 / (2 mu g) - 1", moved[:, 0] / (speed**2 / (2 * friction * GRAVITY)) - 1, 1e-2)
+    gate("sideways or down [m]", moved[:, 1:], 1e-3)
+    gate("velocity at the end [m/s]", np.asarray(final.velocity), 1e-4)
+    gap = jax.vmap(lambda state: joint_gaps(model, state).translation)(trajectory)
+    gate("gap [m]", np.asarray(gap), 1e-4)
+    assert not trajectory.flags.any()
 
 
 def hanging(count, span, **options):
