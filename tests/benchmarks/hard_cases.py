@@ -336,18 +336,10 @@ def _cubes(ratio: float, tiers: tuple[str, ...], tested: tuple[str, ...], peers:
 
 
 def _dragged(ratio: float, tiers: tuple[str, ...], tested: tuple[str, ...]) -> Case:
-    return Case(
-        "B1",
-        f"cube of {ratio:g} times the mass on a cube, pulled",
-        lambda options: hard_scenes.two_cubes(ratio, options),
-        2.0,
-        lambda run: standing(run, 0.2),
-        REST,
-        tiers,
-        tested,
-        # Half of what its friction holds; at its lower face, since pulled by its centre a heavy one tips the pair over.
-        push=Push((0.5 * 0.9 * ratio * GRAVITY, 0.0, 0.0), body=2, point=(0.0, -0.1, 0.0)),
-    )
+    plain = _cubes(ratio, tiers, tested, "")
+    # Half of what its friction holds; at its lower face, since pulled by its centre a heavy one tips the pair over.
+    push = Push((0.5 * 0.9 * ratio * GRAVITY, 0.0, 0.0), body=2, point=(0.0, -0.1, 0.0))
+    return dataclasses.replace(plain, what=f"{plain.what}, pulled", push=push)
 
 
 def _loaded_pyramid(ratio: float) -> Case:

@@ -14,7 +14,7 @@ from tests.benchmarks.accelerator import pushes, warp_engine
 from tests.benchmarks.timing import Block, summary
 from tests.benchmarks.work_precision import engine, jax_engines
 from tests.benchmarks.work_precision.jax_program import JaxProgram
-from tests.benchmarks.work_precision.scenes import SCENES, TIGHT_QUICK, Scene
+from tests.benchmarks.work_precision.scenes import SCENES, TIGHT_QUICK, Scene, start_of
 from tests.benchmarks.work_precision.worlds import Motion
 
 DT = 1 / 240
@@ -141,7 +141,7 @@ def _report(found: Scene, entry: Entry) -> dict[str, Any]:
     norm_error = np.abs(np.linalg.norm(pushed.orientation, axis=-1) - 1).max()
     means = bool(pushed.finite and norm_error < 1e-3 and np.abs(pushed.velocity).max() < FASTEST)
     frames = entry.record()
-    start = Motion(*(leaf[: found.worlds] for leaf in dataclasses.astuple(_start_of(found))))
+    start = start_of(found.name, found.worlds)
     return {
         "rate": summary(entry.rates)["median"] if means else None,
         "rates": entry.rates,
@@ -151,10 +151,6 @@ def _report(found: Scene, entry: Entry) -> dict[str, Any]:
         "compile_seconds": entry.compile_seconds,
         "bytes_per_world": entry.bytes_per_world,
     }
-
-
-def _start_of(found: Scene) -> Motion:
-    return found.vary(found.world.start(found.worlds))
 
 
 def device() -> dict[str, str]:
