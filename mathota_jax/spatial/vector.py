@@ -77,14 +77,18 @@ def where(condition: Any, a: Vec3, b: Vec3) -> Vec3:
 def tangent_basis(normal: Vec3) -> tuple[Vec3, Vec3]:
     """Two unit vectors that complete a unit `normal` to a right-handed frame, without branching.
 
-    Source: T. Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017.
+    Orthogonal to the normal by the terms themselves, so that a normal whose length is 1 to round-off only brings nothing of
+    what goes along it into the tangents: a column of aligned bodies stays aligned to the last bit.
+
+    Source: T. Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 6(1), 2017, with ``1 - x^2`` and ``1 - y^2``
+    written by the other two components.
     """
     sign = jnp.where(normal.z >= 0, 1.0, -1.0).astype(normal.z.dtype)
     a = -1.0 / (sign + normal.z)
     b = normal.x * normal.y * a
     return (
-        Vec3(1.0 + sign * normal.x * normal.x * a, sign * b, -sign * normal.x),
-        Vec3(b, sign + normal.y * normal.y * a, -normal.y),
+        Vec3(sign * (normal.z - normal.y * normal.y * a), sign * b, -sign * normal.x),
+        Vec3(b, normal.z - normal.x * normal.x * a, -normal.y),
     )
 
 

@@ -445,7 +445,7 @@ CASES: tuple[Case, ...] = (
     _stack(20, ("soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),
     _stack(40, ("converged",), "PyBullet collapses; MuJoCo dips 0.0056; soft steps, in theory, 0.011"),
     _column("spheres", Sphere(0.5), ("soft_step",)),
-    _column("cylinders", Cylinder(0.5, 0.5), ()),
+    _column("cylinders", Cylinder(0.5, 0.5), ("soft_step",)),
     Case(
         "B4",
         "wall of 210 cubes",
