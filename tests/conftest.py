@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+from tests.long_compiles import LONG_COMPILES
 from tests.marks import QUICK_COMPILER
 from tests.shortfalls import SHORTFALLS, TIMINGS
 
@@ -39,12 +40,19 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the gates that are not met yet as strict expected failures."""
+    """Marks the gates that are not met yet as strict expected failures, and tests that compile for long as slow."""
     for item in items:
         for prefix, reason in {**SHORTFALLS, **TIMINGS}.items():
-            if item.nodeid == prefix or item.nodeid.startswith(prefix + "["):
+            if _is_of(item, prefix):
                 item.add_marker(pytest.mark.xfail(strict=prefix in SHORTFALLS, reason=reason))
+        if any(_is_of(item, prefix) for prefix in LONG_COMPILES):
+            item.add_marker(pytest.mark.slow)
+
+
+def _is_of(item: pytest.Item, prefix: str) -> bool:
+    return item.nodeid == prefix or item.nodeid.startswith(prefix + "[")
 
 
 @pytest.hookimpl(trylast=True)
