@@ -17,9 +17,6 @@ SHORTFALLS: dict[str, str] = {
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
     "rebounds would gain energy all of that step are cut, which is 0.2 % of it",
-    "tests/physics/test_hard_scenes.py::test_gates[B10d 8 x 8 balls under a plank pressed by up to 5e6 N-pgs]": "overlap "
-    "0.21 of a diameter, gate 0.1, and a speed of 1930 m/s, gate 8.9: the force alone changes that of the plank, of 40 kg, "
-    "by 2000 m/s in a step at the end. With soft_step something ends 201 diameters deep, and contacts overflow",
     "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",

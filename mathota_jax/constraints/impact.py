@@ -47,13 +47,21 @@ def impact(approach: Approach, dt: Array) -> tuple[Array, Array]:
     # Only of those that hit: a gap of metres over next to no speed has an infinite derivative, times 0.
     time = jnp.clip(safe_divide(gap, stopped), 0.0, dt)
     # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
-    share = safe_divide(stopped, stopped + norm(approach.gravity) * dt)
+    share = safe_divide(stopped, stopped + _load(approach, dt))
     lever = 0.5 * dt + share * (0.5 * dt - time)
     if approach.restitution is None:
         return target, lever
     acceleration = (approach.free - start) / dt
     bounce_velocity, bounce_time, bounces = _bounce(approach, approach.restitution, gap, acceleration, dt, dt)
     return jnp.where(bounces, bounce_velocity, target), jnp.where(bounces, dt - bounce_time, lever)
+
+
+def _load(approach: Approach, dt: Array) -> Array:
+    """Velocity by which a contact has to hold its bodies up in a step: their weight, or what else presses them together.
+
+    A body that sinks a little while a force of many times its weight presses it down is not thrown out by that force.
+    """
+    return jnp.maximum(norm(approach.gravity) * dt, approach.start - approach.free)
 
 
 def loaded(approach: Approach, target: Array, lever: Array, dt: Array) -> tuple[Array, Array]:
@@ -63,7 +71,7 @@ def loaded(approach: Approach, target: Array, lever: Array, dt: Array) -> tuple[
     through the step: the lever of the impact, all of the step, would lift it by twice its fall.
     """
     bounces, asked = target > 0, jnp.maximum(target - approach.free, 0.0)
-    share = safe_divide(asked, asked + norm(approach.gravity) * dt)
+    share = safe_divide(asked, asked + _load(approach, dt))
     lasting = 0.5 * dt + share * (lever - 0.5 * dt)
     return jnp.where(bounces, asked, 0.0), jnp.where(bounces, lasting, lever)
 
