@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.long_compiles import LONG_COMPILES
+from tests.long_compiles import IN_FLOAT32, LONG_COMPILES
 from tests.marks import QUICK_COMPILER
 from tests.shortfalls import SHORTFALLS, TIMINGS
 
@@ -47,8 +47,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for prefix, reason in {**SHORTFALLS, **TIMINGS}.items():
             if _is_of(item, prefix):
                 item.add_marker(pytest.mark.xfail(strict=prefix in SHORTFALLS, reason=reason))
-        if any(_is_of(item, prefix) for prefix in LONG_COMPILES):
+        if any(_is_of(item, prefix) for prefix in LONG_COMPILES) or _is_for_float32(item):
             item.add_marker(pytest.mark.slow)
+
+
+def _is_for_float32(item: pytest.Item) -> bool:
+    parameters = getattr(getattr(item, "callspec", None), "params", {})
+    return item.nodeid.startswith(IN_FLOAT32) and parameters.get("precision") == "float64"
 
 
 def _is_of(item: pytest.Item, prefix: str) -> bool:
