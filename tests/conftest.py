@@ -11,7 +11,6 @@ import jax
 import numpy as np
 import pytest
 
-from tests.long_compiles import IN_FLOAT32, LONG_COMPILES
 from tests.marks import QUICK_COMPILER
 from tests.shortfalls import SHORTFALLS, TIMINGS
 
@@ -40,24 +39,12 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest selects by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the gates that are not met yet as strict expected failures, and tests that compile for long as slow."""
+    """Marks the gates that are not met yet as strict expected failures."""
     for item in items:
         for prefix, reason in {**SHORTFALLS, **TIMINGS}.items():
-            if _is_of(item, prefix):
+            if item.nodeid == prefix or item.nodeid.startswith(prefix + "["):
                 item.add_marker(pytest.mark.xfail(strict=prefix in SHORTFALLS, reason=reason))
-        if any(_is_of(item, prefix) for prefix in LONG_COMPILES) or _is_for_float32(item):
-            item.add_marker(pytest.mark.slow)
-
-
-def _is_for_float32(item: pytest.Item) -> bool:
-    parameters = getattr(getattr(item, "callspec", None), "params", {})
-    return item.nodeid.startswith(IN_FLOAT32) and parameters.get("precision") == "float64"
-
-
-def _is_of(item: pytest.Item, prefix: str) -> bool:
-    return item.nodeid == prefix or item.nodeid.startswith(prefix + "[")
 
 
 @pytest.hookimpl(trylast=True)

@@ -46,7 +46,7 @@ def impact(approach: Approach, dt: Array) -> tuple[Array, Array]:
     stopped = jnp.where(hits, jnp.maximum(-start, 0.0), 0.0)
     # Only of those that hit: a gap of metres over next to no speed has an infinite derivative, times 0.
     time = jnp.clip(safe_divide(gap, stopped), 0.0, dt)
-    # Share of the impulse that stops an approach at `time`; the rest holds the weight, all through the step.
+    # Share of the impulse that stops an approach at `time`; the rest carries the load, all through the step.
     share = safe_divide(stopped, stopped + _load(approach, dt))
     lever = 0.5 * dt + share * (0.5 * dt - time)
     if approach.restitution is None:

@@ -4,8 +4,10 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, Sphere, rollout
+from tests.marks import QUICK_IN_FLOAT64
 from tests.scenes import undamped
 
 LIMIT = {"float32": 1e-4, "float64": 1e-6}
@@ -38,6 +40,7 @@ def test_head_on_collision(precision, gate):
         gate(f"d v2 / d {name} / truth - 1", slopes[name] / truth - 1, LIMIT[str(precision)])
 
 
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_rod_struck_off_centre(precision, gate):
     check_struck_rod(gate, str(precision), 0.0, lambda builder, surface: None)
 

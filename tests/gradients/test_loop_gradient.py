@@ -6,6 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mathota_jax import rollout
 from tests.physics.test_loops import linkage
@@ -43,12 +44,14 @@ def test_reverse_mode_is_central_differences(float64, gate):
     gate("reverse mode - quotient", (backward - quotient) / np.abs(quotient).max(), 1e-6)
 
 
+@pytest.mark.slow
 def test_forward_mode_is_reverse_mode(float64, gate):
     end, backward = problem()
     forward = np.asarray(jax.jit(jax.jacfwd(end))(jnp.array(START)))
     gate("modes", (forward - backward) / np.abs(backward).max(), 1e-9)
 
 
+@pytest.mark.slow
 def test_no_derivative_is_nan(float64):
     """By every leaf, also by those that break what the redundant rows agree on."""
     model, state = linkage(2.0, 1.0, dt=1 / 240)

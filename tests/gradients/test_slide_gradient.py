@@ -83,6 +83,7 @@ def test_after_stopping(precision, gate):
         gate(f"d v / d {name} at rest", value, 1e-3)
 
 
+@pytest.mark.slow
 def test_forward_mode_equals_reverse_mode(float64):
     model, state = slab_on_plane(friction=FRICTION, options=undamped(dt=DT))
     parameters = {"speed": SPEED, "friction": FRICTION, "mass": 1.0, "gravity": GRAVITY}

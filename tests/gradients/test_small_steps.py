@@ -70,6 +70,7 @@ def scene():
         return leaves, slopes, rod
 
 
+@pytest.mark.slow
 def test_a_pendulum_by_its_parameters(scene, float64, gate):
     leaves, slopes, rod = scene
     found, (value, _) = slopes(leaves, jnp.array([1.0, 0.0]))
@@ -81,6 +82,7 @@ def test_a_pendulum_by_its_parameters(scene, float64, gate):
         gate(f"d angle / d {name} / truth - 1", found[name][index] / truth - 1, 1e-3)
 
 
+@pytest.mark.slow
 def test_central_differences(scene, float64, gate):
     leaves, slopes, _ = scene
     weights = jnp.array([0.0, 1.0])

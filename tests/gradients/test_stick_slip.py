@@ -60,6 +60,7 @@ def test_both_sides_of_the_threshold(precision, gate):
     assert velocity[FACTORS.index(6.0 / THRESHOLD)] == pytest.approx(2.076, abs=limit * 10)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_at_the_threshold_the_derivative_is_a_sub_gradient(precision):
     _, velocity, by_force, by_friction = pushed(np.array(FACTORS))
     at = FACTORS.index(1.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import BallAndSocket, Box, Hinge, SceneBuilder, Sphere
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, invariants, motion, record_worlds, repeat, rotation_matrix, undamped
 
 SOLVERS = {"default": {}, "converged": {"solver": "converged"}, "sweeps": {"exact_joints": False}}
@@ -95,6 +96,7 @@ def test_short_chains_swing_as_they_should(float64, links, gate):
     gate("energy / swing energy", energy, 2e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_chain_with_a_heavy_end(precision, gate):
     """Benchmark A5, variant H: 10 kg at the end of 20 links of 50 g; MuJoCo's implicit integrator is NaN at 1/100 s."""
     model, state = chain(20, tip_mass=10.0, dt=1 / 240)
@@ -145,6 +147,7 @@ def test_passive_chains_gain_no_energy(links, thickness, rate, gate):
     gate("energy left: it swings", -np.minimum((energy - energy[0]) / 4.905, 0.0), 1.0)
 
 
+@pytest.mark.slow
 def test_four_bar_loop(precision, gate):
     """Four hinges about parallel axes leave one freedom but forbid 20 of 18: the rows agree, and the bars swing."""
     builder = SceneBuilder(gravity=DOWN)

@@ -21,6 +21,7 @@ from mathota_jax import (
     Sphere,
     step,
 )
+from tests.marks import slow_but
 from tests.scenes import (
     advance,
     body_on_plane,
@@ -247,7 +248,11 @@ def test_a_fast_turn_keeps_its_energy(float64, dt, gate):
     gate("energy / start - 1", energy / np.sum(inertia * spin**2) - 1, 0.02 if dt < 0.05 else 0.3)
 
 
-@pytest.mark.parametrize(("friction", "restitution"), [(0.3, 0.5), (0.3, 0.0), (0.0, 0.0), (0.0, 0.5)], ids=str)
+@pytest.mark.parametrize(
+    ("friction", "restitution"),
+    [pytest.param(0.3, 0.5, marks=pytest.mark.slow), (0.3, 0.0), (0.0, 0.0), (0.0, 0.5)],
+    ids=str,
+)
 def test_a_spinning_plank_gains_no_energy(float64, gate, friction, restitution):
     """A plank that turns by a radian and more in a step is stopped in the orientation in which it meets the wall."""
     model, state = flying(Box((0.2, 0.02, 0.1)), Box((0.005, 3, 3)), True, {"friction": 0.3, "restitution": 0.5})
@@ -308,7 +313,7 @@ def jointed_pairs(settings):
 PAIRS = {"default": (), "continuous": (("continuous", True),), "soft_step": (("solver", "soft_step"),)}
 
 
-@pytest.mark.parametrize("settings", PAIRS)
+@pytest.mark.parametrize("settings", slow_but(("default",), PAIRS))
 def test_a_jointed_pair_that_hits_a_wall_gains_no_energy(float64, gate, settings):
     energy, _ = jointed_pairs(PAIRS[settings])
     gate("energy / that at first - 1", np.maximum(energy - 1, 0.0), 0.001)

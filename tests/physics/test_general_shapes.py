@@ -9,6 +9,7 @@ import pytest
 
 from mathota_jax import Box, Cone, Cylinder, Plane, Polyhedron, SceneBuilder, rollout
 from tests.hulls import BOX_CORNERS
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, undamped
 
 DT = 1 / 240
@@ -29,6 +30,7 @@ def run(model, state, steps):
     return jax.jit(rollout, static_argnums=2)(model, state, steps)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_cylinder_rolls_down_a_slope(precision, gate):
     """A solid cylinder that rolls without slipping accelerates with (2/3) g sin(slope)."""
     slope, steps = 0.2, 240
@@ -40,6 +42,7 @@ def test_cylinder_rolls_down_a_slope(precision, gate):
     gate("no slip [m/s]", final.velocity[1, 0] + 0.1 * final.angular_velocity[1, 2], 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_cube_as_polyhedron_slides_like_the_box(precision, gate):
     """The same cube in two descriptions; v^2 / (2 mu g) in both."""
     finals = []
@@ -55,6 +58,7 @@ def test_cube_as_polyhedron_slides_like_the_box(precision, gate):
     [(Cylinder(0.1, 0.1), 0.1), (Cone(0.1, 0.1), 0.05), (Polyhedron(0.1 * BOX_CORNERS), 0.1)],
     ids=["cylinder", "cone", "polyhedron"],
 )
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_stands_on_a_plane(precision, shape, height, gate):
     model, state = on_plane(shape, height=height)
     final, _ = run(model, state, 480)

@@ -34,7 +34,7 @@ def test_gates(case, tier, gate):
     [
         ("A1 balls on a board, pushed diagonally", "pgs", 0.5),
         ("B7a ball of 672 links' mass on a chain of 40", "pgs", 3.5),
-        ("B7b bridge of 160 links", "pgs", 3.5),
+        pytest.param("B7b bridge of 160 links", "pgs", 3.5, marks=pytest.mark.slow),
     ],
 )
 def test_gates_in_a_short_run(name, tier, seconds, gate):

@@ -20,6 +20,7 @@ from mathota_jax import (
     Sphere,
     joint_position,
 )
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -114,6 +115,7 @@ def of_body(precision, name):
     }
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_conical_pendulum(precision, gate):
     """It turns at ``sqrt(g / (l cos a))`` and keeps its height."""
     found = of_body(precision, "cone")
@@ -123,6 +125,7 @@ def test_conical_pendulum(precision, gate):
     gate("length / truth - 1", np.linalg.norm(found["place"], axis=1) / ROD - 1, 1e-4)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_rod_is_a_mathematical_pendulum(precision, gate):
     """The ball on a rod does not turn: ``a'' = -(g / l) sin a`` from a quarter turn."""
     found = of_body(precision, "rod")
@@ -140,6 +143,7 @@ def test_rod_is_a_mathematical_pendulum(precision, gate):
     gate("spin [rad/s]", found["spin"], 1e-6)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_rope_is_slack_then_taut(precision, gate):
     """A parabola until the rope is taut; then it takes the speed along itself, once, and is never longer."""
     found = of_body(precision, "rope")
@@ -163,6 +167,7 @@ def test_rope_is_slack_then_taut(precision, gate):
     gate("energy gained at any step / loss", max(0.0, np.diff(found["energy"]).max()) / loss, 2e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_swing_limit_holds(precision, gate):
     found = of_body(precision, "swing")
     swing = np.arccos(np.clip(found["rotation"][:, 1, 1], -1, 1))
@@ -171,6 +176,7 @@ def test_swing_limit_holds(precision, gate):
     gate("energy gained at any step / start's kinetic", max(0.0, np.diff(found["energy"]).max()) / 2.0, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_twist_limits_hold(precision, gate):
     """The box turns about the vertical; at the stop it stays, since stops have no restitution."""
     found = of_body(precision, "twist")
@@ -184,6 +190,7 @@ def test_twist_limits_hold(precision, gate):
     gate("free until the stop [rad]", (found["coordinate"] + 3.0 * TIME)[early], 1e-4)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_friction_of_a_ball_stops_its_spin(precision, gate):
     """A constant torque: ``w = w0 - F t / I`` until it stops."""
     found = of_body(precision, "dry")
@@ -193,6 +200,7 @@ def test_friction_of_a_ball_stops_its_spin(precision, gate):
     gate("spin [rad/s]", found["spin"][:, 1] - truth, 1e-4)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_damping_of_a_ball_decays_its_spin(precision, gate):
     found = of_body(precision, "viscous")
     truth = 2.0 * np.exp(-0.05 / found["inertia"][1] * TIME)
@@ -272,6 +280,7 @@ def gaps_closed(precision):
 
 
 @pytest.mark.parametrize("name", GAPS)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_gap_closes_without_gaining_energy(precision, name, gate):
     """The speed of the correction is gone when the gap is: nothing is left of it, in no direction."""
     model, record = gaps_closed(str(precision))

@@ -8,6 +8,7 @@ import pytest
 from scipy.special import ellipk
 
 from mathota_jax import Box, Hinge, SceneBuilder, Slider, Sphere, joint_position, joint_velocity
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -69,6 +70,7 @@ def gap(record, arm=ARM):
     return np.linalg.norm(np.asarray(record["position"], dtype=float)[..., 1, :] + arm * rotation[..., :, 1], axis=-1)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_pendulum_period_energy_and_gap(precision, gate):
     amplitudes = np.array([0.2, 1.0, 2.0])
     worlds = [pendulum(angle) for angle in amplitudes]
@@ -96,6 +98,7 @@ def test_pendulum_period_energy_and_gap(precision, gate):
     gate("out of plane [m]", np.asarray(record["position"])[:, :, 1, 2], 1e-5)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_joint_position_is_the_angle_of_the_child(precision, gate):
     """The sign is parent to child, right-handed about the axis, and the rate is its derivative."""
     model, state = pendulum(0.4, gravity=(0, 0, 0), rate=1.5)
@@ -107,6 +110,7 @@ def test_joint_position_is_the_angle_of_the_child(precision, gate):
     gate("angle at 0.5 s / truth - 1", record["angle"][-1, 0, 0] / 0.75 - 1, 5e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_free_turn_about_a_hinge_keeps_its_speed(precision, gate):
     """The centripetal force of the joint does no work, so an off-centre rod turns for ever."""
     model, state = pendulum(gravity=(0, 0, 0), rate=3.0)
@@ -114,6 +118,7 @@ def test_free_turn_about_a_hinge_keeps_its_speed(precision, gate):
     gate("rate after 5 s / start - 1", joint_velocity(model, final)[0] / 3.0 - 1, 0.01)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_slider_on_a_slope_falls_as_g_sin_theta(precision, gate):
     slopes = [10.0, 30.0, 60.0]
     worlds = [block_on_rail(gravity=tilted_gravity(angle)) for angle in slopes]
@@ -136,6 +141,7 @@ def test_slider_along_an_oblique_rail(float64, gate):
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_hinge_limits_hold(precision, side, gate):
     """The rod starts level and falls onto its stop; the stops are not symmetric."""
     limits = (-0.3, 0.5)
@@ -150,6 +156,7 @@ def test_hinge_limits_hold(precision, side, gate):
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_slider_limits_hold(precision, side, gate):
     limits = (-0.2, 0.5)
     model, state = block_on_rail(gravity=(side * GRAVITY, 0.0, 0.0), limits=limits)
@@ -162,6 +169,7 @@ def test_slider_limits_hold(precision, side, gate):
     gate("free fall before the stop [m]", side * place[:39] - 0.5 * GRAVITY * free**2, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_damping_decays_at_its_rate(precision, gate):
     """Viscous joint damping c: the rate falls as exp(-c t / I), the sliding speed as exp(-c t / m)."""
     damping, time = 0.05, 1.0
@@ -178,6 +186,7 @@ def test_damping_decays_at_its_rate(precision, gate):
 
 
 @pytest.mark.parametrize("damping", [0.01, 3.0, 400.0])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_damped_coordinate_under_a_constant_force(precision, damping, gate):
     """``m u' = f - c u``: the speed approaches f / c as 1 - exp(-c t / m), at any damping and step."""
     model, state = block_on_rail(gravity=(0, 0, 0), damping=damping, motor={"limit": 5.0})
@@ -192,6 +201,7 @@ def test_damped_coordinate_under_a_constant_force(precision, damping, gate):
     ("gear", "action", "torque"),
     [(1.0, 0.2, 0.2), (1.0, -0.2, -0.2), (3.0, 0.2, 0.6), (1.0, 9.0, 0.5), (3.0, -9.0, -1.5)],
 )
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_torque_motor(precision, gear, action, torque, gate):
     """The action is clipped to the limit, then multiplied by the gear; off-centre the rod turns about the pivot."""
     for arm, inertia in ((0.0, ROD_INERTIA_Z), (ARM, PIVOT_INERTIA)):
@@ -200,6 +210,7 @@ def test_torque_motor(precision, gear, action, torque, gate):
         gate(f"arm {arm}: rate / truth - 1", joint_velocity(model, final)[0] / (0.1 * torque / inertia) - 1, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_force_motor(precision, gate):
     model, state = block_on_rail(gravity=(0, 0, 0), motor={"limit": 5.0})
     final = advance(model, state, 120, np.array([3.0]))
@@ -217,6 +228,7 @@ def two_free_bodies(joint, motor):
 
 
 @pytest.mark.parametrize(("joint", "motor"), [(Hinge, "torque"), (Slider, "torque")])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     model, state = two_free_bodies(joint, motor)
     final = advance(model, state, 120, np.array([0.5]))
@@ -228,6 +240,7 @@ def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     assert abs(float(joint_velocity(model, final)[0])) > 0.1, "the motor does not move the joint"
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_double_pendulum_keeps_its_joints_closed(precision, gate):
     """Two links released level; the lower one is ten times as heavy."""
     builder = SceneBuilder(gravity=DOWN)
@@ -260,6 +273,7 @@ def test_jointed_bodies_do_not_collide(float64):
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("lower", [-1.0, -3.0, -np.pi])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_stop_at_half_a_turn(precision, gate, lower, sign):
     """The arm that turns at 4 rad/s stops at pi, where the angle jumps by a full turn, and stays there."""
     limits = sorted((sign * lower, sign * np.pi))

@@ -132,6 +132,7 @@ def test_a_driven_linkage_turns_as_told_and_stops_at_its_stop(solver, gate):
     assert not trajectory.flags.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_frame_slides_over_a_plane(solver, gate):
     """Four hinged bars lie on a plane and slide until friction stops them: contacts beside a loop."""
@@ -180,6 +181,7 @@ def hanging(count, span, **options):
     return *builder.build(undamped(**options)), tension
 
 
+@pytest.mark.slow
 def test_catenary(precision, gate):
     """A chain that hangs at rest between two points stays, with the tension of statics."""
     count = 10
@@ -192,8 +194,8 @@ def test_catenary(precision, gate):
     gate("weight on a support / truth - 1", -float(force[-1, 1]) / (0.5 * count * GRAVITY) - 1, 2e-3)
 
 
-@pytest.mark.parametrize("joint", [Hinge, pytest.param(BallAndSocket, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", [Hinge, BallAndSocket])
 def test_a_free_ring_keeps_its_momenta(precision, joint, gate):
     """Six bars in a ring, spinning and changing shape in space."""
     builder = SceneBuilder(gravity=(0, 0, 0))

@@ -10,6 +10,7 @@ import pytest
 
 from mathota_jax import Box, Capsule, Options, Plane, Polyhedron, SceneBuilder, Sphere, contact_forces, contacts, step
 from mathota_jax.state import Flag
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import GRAVITY, advance, advance_worlds, invariants, repeat, stack
 
 RADIUS = 0.1
@@ -208,6 +209,7 @@ def test_same_gradient_as_with_a_slot_for_every_pair(float64, gate):
 
 
 @pytest.mark.parametrize("count", [64, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_cloud_conserves_momentum_and_does_not_gain_energy(count, precision, gate):
     """No gravity, no ground in reach, spheres thrown at each other: several hundred collisions."""
     model, state = heap(count, gravity=0.0, height=1000.0, restitution=0.5)

@@ -25,7 +25,7 @@ from mathota_jax import (
     substep,
 )
 from mathota_jax import advance as advance_frame
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
 from tests.physics.test_chain import TIPS, chain
 from tests.scenes import (
     DOWN,
@@ -224,13 +224,7 @@ OVERCONSTRAINED = {
 }
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        case if case in ("hinge twice", "rod that can not reach") else pytest.param(case, marks=pytest.mark.slow)
-        for case in OVERCONSTRAINED
-    ],
-)
+@pytest.mark.parametrize("case", slow_but(("rod that can not reach",), OVERCONSTRAINED))
 @pytest.mark.parametrize("precision", ["float32"], indirect=True)
 def test_a_loop_with_too_many_joints_stays_finite(precision, case, gate):
     """Rows that say the same twice, or what can not be: nothing is NaN, and no energy comes from nothing.

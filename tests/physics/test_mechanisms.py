@@ -7,6 +7,7 @@ import pytest
 
 from mathota_jax import BallAndSocket, Box, Capsule, Hinge, Plane, SceneBuilder, Sphere, joint_gaps, joint_position
 from tests.benchmarks import hard_scenes
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, GRAVITY, advance_worlds, motion_and_penetration, record_worlds, repeat, undamped
 
 SOLVERS = ["pgs", pytest.param("converged", marks=pytest.mark.slow)]
@@ -92,6 +93,7 @@ def test_a_chain_falls_on_the_ground(solver, gate):
     gate("energy gained / that of the fall", max(0.0, total.max() - total[0]) / total[0], 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_chain_that_starts_open_is_closed_and_not_whipped(precision, gate):
     """B7c: four level links of 1 m, 0.5 m apart. After a step they have the speed of a fall, not that of the way."""
     dt = 1 / 60

@@ -5,8 +5,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mathota_jax import Box, Hinge, SceneBuilder, Sphere
+from tests.marks import QUICK_IN_FLOAT64
 from tests.scenes import advance, body_on_plane, motion, record_worlds, repeat, sphere_on_plane, undamped
 
 
@@ -15,6 +17,7 @@ def trajectory(model, state, count=60):
     return np.concatenate([np.asarray(leaf, dtype=float).ravel() for leaf in jax.tree.leaves(record)])
 
 
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_zero_friction_equals_no_friction(precision, gate):
     for scene in (sphere_on_plane, lambda **k: body_on_plane(Box((0.1, 0.1, 0.2)), position=(0, 0.15, 0), **k)):
         start = {"velocity": (1.0, 0.0, 0.5), "angular_velocity": (0.0, 2.0, 0.0), "options": undamped(dt=1 / 240)}

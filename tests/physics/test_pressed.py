@@ -5,19 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Plane, SceneBuilder, Sphere, apply_force, contact_forces, step
+from mathota_jax import apply_force, contact_forces, step
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.scenes import DOWN, GRAVITY, undamped
+from tests.scenes import GRAVITY, box_stack, sphere_on_plane, undamped
 
 DT = 1 / 60
-
-
-def column(count, **options):
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.6)
-    for level in range(count):
-        builder.add_body(Box((0.5, 0.5, 0.5)), mass=1.0, position=(0, 0.5 + level, 0), friction=0.6)
-    return builder.build(undamped(dt=DT, **options))
 
 
 def press(model, state, force):
@@ -30,13 +22,10 @@ def press(model, state, force):
 @pytest.mark.parametrize("solver", ["pgs", "converged"])
 def test_a_falling_ball_that_is_pressed_down_stops_where_it_lands(precision, solver, gate):
     """Of what its contact does in the step only the share that stops it acts for all of the step, the load by half of it."""
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True)
-    builder.add_body(Sphere(0.5), mass=1.0, position=(0, 0.5, 0), velocity=(0, -0.5, 0))
-    model, state = builder.build(undamped(dt=DT, solver=solver))
+    model, state = sphere_on_plane(velocity=(0.0, -0.5, 0.0), options=undamped(dt=DT, solver=solver))
     new = jax.jit(lambda state, force: step(model, press(model, state, force)))
     for force in (0.0, 10.0, 1e3, 1e4):
-        moved = float(new(state, force).position[1, 1]) - 0.5
+        moved = float(new(state, force).position[1, 1]) - 0.1
         gate(f"moved under {force:g} N / fall without the ground", moved / (0.5 * DT), 5e-3)
 
 
@@ -44,7 +33,7 @@ def test_a_falling_ball_that_is_pressed_down_stops_where_it_lands(precision, sol
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_force_that_grows_lifts_nothing(precision, count, gate):
     """To a thousand times the weight of a box in 2 s; a column hopped by four times its height."""
-    model, state = column(count)
+    model, state = box_stack(count, 0.5, undamped(dt=DT), friction=0.6)
 
     def body(current, force):
         new = step(model, press(model, current, force))

@@ -262,6 +262,7 @@ def test_springs_follow_the_oscillator(float64, gate):
             gate(f"{name}: place - truth, relative to the amplitude", (found["place"] - truth) / REST, limit)
 
 
+@pytest.mark.slow
 def test_springs_and_servos_of_any_stiffness_come_to_rest(float64, gate):
     for name, target in (("rigid", REST), ("rigid and damped", REST), ("rigid servo", 0.2)):
         _, found = of(float64, name, solver="soft_step")
@@ -287,6 +288,7 @@ def test_friction_and_motors_give_no_more_than_their_caps(float64, gate):
 # Other features ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sleep_fast_bodies_and_a_step_of_no_time():
     """A box on a shelf that sleeps, a sphere at 180 m/s, 15 thicknesses a step, that must not pass a wall, and dt = 0."""
     builder = SceneBuilder(gravity=DOWN)
@@ -375,6 +377,7 @@ def test_derivatives_of_a_bounce(gate):
     check(gate, slopes, UNDER_GRAVITY, 0.01)
 
 
+@pytest.mark.slow
 def test_gradient_through_the_broadphase(float64, gate):
     """Reverse mode through turns that are known only in the step, against forward mode and a difference quotient."""
     builder = SceneBuilder(gravity=DOWN)

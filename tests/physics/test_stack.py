@@ -6,6 +6,7 @@ import pytest
 
 from mathota_jax import Box, Options, Sphere, contact_forces, contacts
 from tests.benchmarks.hard_scenes import column
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import (
     advance,
     advance_worlds,
@@ -21,6 +22,7 @@ from tests.scenes import (
 COUNT, DEFAULT_GRAVITY = 10, 9.81
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_ten_boxes_stand(precision, gate):
     model, state = box_stack(COUNT)
     final, record = record_worlds(repeat(model, 1), repeat(state, 1), 1200, motion_and_penetration)
@@ -33,6 +35,7 @@ def test_ten_boxes_stand(precision, gate):
     assert int(final.flags[0]) == 0
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_ten_boxes_stay_in_place(precision, gate):
     model, state = box_stack(COUNT)
     final, record = record_worlds(repeat(model, 1), repeat(state, 1), 1200, motion_and_penetration)
@@ -44,6 +47,7 @@ def test_ten_boxes_stay_in_place(precision, gate):
     assert int(final.flags[0]) == 0
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_each_level_carries_the_weight_above_it(precision, gate):
     model, state = box_stack(COUNT)
     final = advance(model, state, 480)
@@ -68,6 +72,7 @@ def test_warm_start_is_what_carries_a_tall_stack(float64, warm_start):
     assert (sink < 1e-3) == warm_start
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_dropped_boxes_come_to_rest(precision, gate):
     """Sweeps that lengthen their steps too far leave boxes creeping at mm/s after they have landed."""
     orientations = np.random.default_rng(0).normal(size=(16, 4))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Cylinder, Options, Plane, SceneBuilder, Sphere, step
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -42,6 +43,7 @@ def boxes():
     return builder.build(Options(dt=1 / 60, velocity_iterations=300))
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_removing_the_heavy_ball_does_not_lift_the_light_ones(precision, gate):
     model, state = pile()
     loaded = advance(model, state, 120)
@@ -53,6 +55,7 @@ def test_removing_the_heavy_ball_does_not_lift_the_light_ones(precision, gate):
 
 
 @pytest.mark.parametrize("small", [1e-4, 1e-7, 1e-12])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_tiny_step_in_which_a_box_lands(precision, gate, small):
     """The mean force of the impact, times the next step, is no impulse to start from: the box loses what it fell with."""
     builder = SceneBuilder(gravity=DOWN)
@@ -66,6 +69,7 @@ def test_a_tiny_step_in_which_a_box_lands(precision, gate, small):
     gate("spin [rad/s]", record["angular_velocity"][:, 0, 1], 1.0)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_changing_the_time_step_does_not_kick(precision, gate):
     model, state = boxes()
     settled = advance(model, state, 120)
@@ -74,6 +78,7 @@ def test_changing_the_time_step_does_not_kick(precision, gate):
         gate(f"velocity after 1/60 -> {dt:.4f} [m/s]", record["velocity"], 1e-2)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_teleporting_out_and_back_does_not_kick(precision, gate):
     model, state = boxes()
     settled = advance(model, state, 120)
@@ -91,6 +96,7 @@ def test_teleporting_out_and_back_does_not_kick(precision, gate):
     gate("velocity after the return [m/s]", record["velocity"], 1e-2)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_slot_that_changes_its_feature_does_not_reuse_the_impulse(precision, gate):
     """A quarter turn renumbers the corners of the top box; another place on the lower box changes the manifold."""
     model, state = boxes()
@@ -102,6 +108,7 @@ def test_a_slot_that_changes_its_feature_does_not_reuse_the_impulse(precision, g
         gate(f"velocity after a {name} [m/s]", record["velocity"], 1e-2)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_swapping_owners_of_the_cached_contacts_does_not_kick(precision, gate):
     """The two light balls under the heavy one change places: every cached impulse belongs to another pair now."""
     model, state = pile()
@@ -112,6 +119,7 @@ def test_swapping_owners_of_the_cached_contacts_does_not_kick(precision, gate):
     gate("velocity after the swap [m/s]", record["velocity"], 1e-2)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_order_of_the_bodies_does_not_matter(precision, gate):
     results = []
     for order in ((0, 1, 2), (2, 0, 1)):
@@ -130,6 +138,7 @@ def rolling(match):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_rolling_cylinder_keeps_its_contacts(precision, gate):
     """What bears it is half its weight at each end in every step; four sweeps miss that by 14 % from a cold start."""
     error = {}

@@ -10,8 +10,10 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mathota_jax import Box, Flag, Hinge, Plane, SceneBuilder, energy, step
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, advance_worlds, repeat, undamped
 
 WORLDS, BAD = 8, 3
@@ -89,6 +91,7 @@ def finite(states):
     return np.all([np.isfinite(leaf).all((1, 2)) for leaf in leaves], axis=0)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_bad_world_leaves_the_others_alone(precision):
     """The other seven are the same to the bit; the bad one is finite or flagged."""
     models, states = batch()
@@ -124,6 +127,7 @@ def test_a_bad_world_leaves_the_derivatives_of_the_others_alone():
             np.testing.assert_array_equal(slope, np.asarray(mixed)[HEALTHY], err_msg=name)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_time_steps_out_of_all_proportion(precision, gate):
     """Steps of 1e-12 s to 100 s: finite; boxes at rest stay there, and nothing gains energy."""
     models, states = batch()

@@ -111,6 +111,7 @@ def thrown(known, frames=50, count=6):
     ), start
 
 
+@pytest.mark.slow
 def test_whole_motions_show_friction_restitution_and_inertia(gate):
     """Six tosses of a third of a second, of which the fit first sees 0.14 s.
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Hinge, Plane, SceneBuilder, Sphere, contacts, rollout, step
+from tests.marks import slow_but
 from tests.scenes import stack, undamped
 
 WORLDS, STEPS = 3, 3
@@ -105,12 +106,7 @@ def gradient_of_each():
     return loop(jax.grad(cost), parameters())
 
 
-def slow_but(quick, names):
-    """All names; those that are not `quick` compile a program much like one that is."""
-    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
-
-
-@pytest.mark.parametrize("name", slow_but(("vmap(jacfwd)", "jacrev(vmap)"), FIRST_ORDER))
+@pytest.mark.parametrize("name", slow_but(("vmap(jacfwd)",), FIRST_ORDER))
 def test_jacobians(float64, name):
     transform, arrange = FIRST_ORDER[name]
     measured = arrange(jax.jit(transform())(parameters()))

@@ -10,6 +10,7 @@ import pytest
 from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, Planes, candidate_pairs
 from mathota_jax.collision.broadphase.choice import choose_method
 from mathota_jax.spatial.vector import Vec3
+from tests.marks import QUICK_AND_SLOW_PRECISION
 
 WORLDS = 3
 
@@ -112,6 +113,7 @@ def everything(count, static_share=0.0):
 
 @pytest.mark.parametrize("method", BROADPHASES)
 @pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_pairs_are_those_of_brute_force(method, scene, precision):
     count = 61
     rng = np.random.default_rng(len(scene))
@@ -129,6 +131,7 @@ def test_pairs_are_those_of_brute_force(method, scene, precision):
 
 @pytest.mark.parametrize("chunk", [1, 200, 10**6])
 @pytest.mark.parametrize("order", ["static first", "static last", "mixed", "one moves"])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_all_pairs_in_chunks_of_any_size(chunk, order, monkeypatch, precision):
     monkeypatch.setattr(importlib.import_module("mathota_jax.collision.broadphase.all_pairs"), "CHUNK", chunk)
     rng = np.random.default_rng(5)
@@ -176,6 +179,7 @@ def test_inadmissible_pairs_are_left_out(method, float64):
 
 @pytest.mark.parametrize("method", BROADPHASES)
 @pytest.mark.parametrize("scene", ["dense", "coincident", "touching lattice"])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_overflow_keeps_the_deepest_and_is_flagged(method, scene, precision):
     count, capacity = 61, 57
     rng = np.random.default_rng(1)
@@ -196,6 +200,7 @@ def test_overflow_keeps_the_deepest_and_is_flagged(method, scene, precision):
 
 @pytest.mark.parametrize("method", BROADPHASES)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_bad_shapes_are_flagged_and_in_no_pair(method, bad, precision):
     rng = np.random.default_rng(5)
     count = 45
@@ -242,6 +247,7 @@ def planes_and_boxes(dtype, count=40):
 
 
 @pytest.mark.parametrize("method", BROADPHASES)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_planes_meet_what_reaches_below_them(method, precision):
     bounds, admissible, expected = planes_and_boxes(precision)
     pairs = compiled(method, bounds, admissible, 44 * 43 // 2)
