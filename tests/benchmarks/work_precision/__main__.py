@@ -47,16 +47,12 @@ def main(arguments: list[str] | None = None) -> int:
     kept = output / "work_precision.json"
     report = json.loads(kept.read_text()) if options.merge or options.draw else {"scenes": {}}
     if not options.draw:
-        report |= {
-            "date": datetime.date.today().isoformat(),
-            "settings": dataclasses.asdict(settings),
-            "machine": machine(),
-        }
+        report |= {"settings": dataclasses.asdict(settings), "machine": machine()}
         everything = QUICK_SCENES if options.quick else (*SCENES, *EXTRAS)
         for name in options.only or everything:
             print(f"{name} ...", flush=True)
             place = report["scenes"] if name in (*SCENES, GRADIENT.name) else report
-            place[name] = _measure(name, settings)
+            place[name] = _measure(name, settings) | {"date": datetime.date.today().isoformat()}
             write(report, output)  # what is measured is kept, should the run be broken off
     write(report, output)
     print(summary(report["scenes"]))

@@ -25,7 +25,7 @@ def markdown(report: dict) -> str:
         "Written by `python -m tests.benchmarks.work_precision`; do not edit. Every round is in `work_precision.json`.",
         "",
         f"- Machine: {machine['processor']}, {machine['cores']} cores; {versions}",
-        f"- Run: {report['date']}, mode {settings['mode']}, up to {settings['rounds']} interleaved rounds; rates are "
+        f"- Run: {_dates(report)}, mode {settings['mode']}, up to {settings['rounds']} interleaved rounds; rates are "
         "medians of world-steps per CPU-second (`time.process_time`, all threads) over the whole horizon of the run whose "
         "error is given, after compilation; largest error over the worlds of a batch that differ",
         "- Ours: `vmap(step)` in a loop, float32, no damping, otherwise the defaults of the named setting; the number of "
@@ -50,6 +50,14 @@ def markdown(report: dict) -> str:
     for name, result in scenes.items():
         lines += _points(name, result)
     return "\n".join(lines) + "\n"
+
+
+def _dates(report: dict) -> str:
+    """Days of measurement, the latest first, and what was measured on all but that one."""
+    parts = report["scenes"] | {name: report[name] for name in ("features", "scaling") if name in report}
+    latest, *others = sorted({part["date"] for part in parts.values()}, reverse=True)
+    of_day = (", ".join(name for name, part in parts.items() if part["date"] == day) for day in others)
+    return "; ".join((latest, *(f"{day}: {names}" for day, names in zip(others, of_day, strict=True))))
 
 
 def _row(cells: Iterable[Any]) -> str:
@@ -149,27 +157,48 @@ def _extras(report: dict) -> list[str]:
             lines.append(_row((name, *cells, f"{row['compile_cpu_seconds']:.1f}")))
         lines.append("")
     if scaling and "failed" not in scaling:
-        lines += ["## Scaling", "", "Sliding cube at dt 1/240 s:", ""]
-        lines += _head("worlds", "world-steps per CPU-second", "per wall second", "bytes a world", "error")
-        for row in scaling["worlds"]:
-            cells = (rate(row["rate"]), rate(row["wall_rate"]), f"{row['bytes_per_world']:.0f}")
-            lines.append(_row((row["worlds"], *cells, error_text("slide", row["error"]))))
-        single = scaling["single"]
-        lines += ["", "One world, one cube on a plane (targets: 60 us a call, 15 us inside a loop): "]
-        lines += [
-            f"{single['call']['cpu_microseconds']:.0f} CPU-us a compiled call, "
-            f"{single['loop']['cpu_microseconds']:.0f} CPU-us a step inside a loop.",
-            "",
-            "Spheres above a plane, one world, CPU-milliseconds a step (pairs held; see `body_count.py`):",
-            "",
-        ]
-        names = [key for key in scaling["bodies"][0] if isinstance(scaling["bodies"][0][key], dict)]
-        lines += _head("bodies", "contacts from", "slots", "compile [CPU-s]", *names)
-        for row in scaling["bodies"]:
-            cells = (f"{row[key]['milliseconds']:.2f} ({row[key]['pairs']})" for key in names)
-            lines.append(_row((row["bodies"], row["method"], row["slots"], f"{row['compile']:.1f}", *cells)))
-        lines.append("")
+        lines += _scaling(scaling)
     return lines
+
+
+def _scaling(found: dict) -> list[str]:
+    lines = ["## Scaling", "", "Sliding cube at dt 1/240 s, and over MuJoCo with its defaults in the same rounds:", ""]
+    lines += _head("worlds", "world-steps per CPU-second", "over MuJoCo", "per wall second", "bytes a world", "error")
+    for row in found["worlds"]:
+        ratio = f"{row['rate'] / row['mujoco_rate']:.3g}x" if row["mujoco_rate"] else "-"
+        cells = (rate(row["rate"]), ratio, rate(row["wall_rate"]), f"{row['bytes_per_world']:.0f}")
+        lines.append(_row((row["worlds"], *cells, error_text("slide", row["error"]))))
+    lines += [
+        "",
+        "One world, one cube on a plane (targets: 60 us a call, 15 us inside a loop). What a call costs is mostly what JAX "
+        "takes to hand over each array, and a thread that waits for work, which counts as CPU time:",
+        "",
+        *_head("a step", "wall time [us]", "CPU time, all threads [us]"),
+    ]
+    forms = {
+        "call": "`jax.jit(step)(model, state)`",
+        "constant": "`jax.jit(functools.partial(step, model))(state)`",
+        "loop": "inside a compiled loop",
+    }
+    for key, form in forms.items():
+        times = found["single"][key]
+        lines.append(_row((form, f"{times['wall_microseconds']:.0f}", f"{times['cpu_microseconds']:.0f}")))
+    lines += [
+        "",
+        "Spheres above a plane, one world, CPU-milliseconds a step, and pairs held (see `body_count.py`):",
+        "",
+    ]
+    names = [key for key in found["bodies"][0] if isinstance(found["bodies"][0][key], dict)]
+    lines += _head("bodies", "contacts from", "slots", "compile [CPU-s]", *names)
+    for row in found["bodies"]:
+        cells = (f"{row[key]['milliseconds']:.2f}" + _pairs(row[key]["pairs"]) for key in names)
+        lines.append(_row((row["bodies"], row["method"], row["slots"], f"{row['compile']:.1f}", *cells)))
+    return [*lines, ""]
+
+
+def _pairs(count: int) -> str:
+    """Pairs that the broadphase holds; it is absent where every pair has slots of its own."""
+    return f" ({count})" if count >= 0 else ""
 
 
 def _batches(scenes: dict[str, dict]) -> list[str]:
