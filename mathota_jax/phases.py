@@ -19,6 +19,7 @@ from mathota_jax.constraints import (
     loops,
     mechanism,
     mechanism_correction,
+    mechanism_links,
     mechanism_rows,
     motor,
     rebound_limit,
@@ -91,8 +92,8 @@ def solve_rows(
     start: tuple[Array, ...],
     change: Array | None = None,
     known: bool = False,
-    held: mechanism.Impulses | None = None,
-) -> tuple[Array, tuple[Array, ...], Array | None, mechanism.Impulses | None]:
+    held: mechanism_links.Impulses | None = None,
+) -> tuple[Array, tuple[Array, ...], Array | None, mechanism_links.Impulses | None]:
     """Phase 5: velocity constraints, unless `start` is `known` to solve them; `change` is what it does to the velocity.
 
     Also 1 for each world (world,) that was not solved, None from "pgs"; and what mechanisms alone are `held` with, which
@@ -116,7 +117,7 @@ def solve_rows(
 
 
 def _solve_mechanisms(
-    scene: Scene, problem: Problem, held: mechanism.Links, velocity: Array, start: tuple[Array, ...]
+    scene: Scene, problem: Problem, held: mechanism_links.Links, velocity: Array, start: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """`solve_rows` where there are mechanisms and other rows: what the former hold, holds exactly in the end."""
     rows = problem.rows
@@ -233,8 +234,8 @@ def correct_positions(
 
 
 def close_joints(
-    model: Model, bodies: Bodies, moved: Bodies, known: mechanism.Impulses | None = None
-) -> tuple[Bodies, mechanism.Impulses]:
+    model: Model, bodies: Bodies, moved: Bodies, known: mechanism_links.Impulses | None = None
+) -> tuple[Bodies, mechanism_links.Impulses]:
     """Mechanisms at the end of the step: their joints closed, and velocities along which they stay closed.
 
     The second is a projection in the metric of the kinetic energy, and so never adds any. Also the impulses of all rounds,
@@ -242,7 +243,7 @@ def close_joints(
     """
     scene = model.scene
 
-    def close(moved: Bodies, of_round: tuple) -> tuple[Bodies, mechanism.Impulses]:
+    def close(moved: Bodies, of_round: tuple) -> tuple[Bodies, mechanism_links.Impulses]:
         is_last, known = of_round
         inertia = moving_inertia(scene, model, moved.orientation)
         joints = joint_rows.joint_rows(model, merge(scene, bodies, moved))
@@ -252,13 +253,15 @@ def close_joints(
         yielding = loops.yielding(model, joints.error)
         if yielding is not None:
             yielding = jnp.where(is_last, 0.0, yielding)
-        links = mechanism.links(scene, joints, moved.position, weights, yielding)
+        links = mechanism_links.links(scene, joints, moved.position, weights, yielding)
         velocity = contact.pack_motion(scene, moved.velocity, moved.angular_velocity)
-        excess, errors = mechanism.rates(links, velocity), mechanism.of_slots(links, joints.error)
-        closing = errors if yielding is None else mechanism.of_slots(links, loops.correctable(model, joints.error))
+        excess, errors = mechanism_links.rates(links, velocity), mechanism_links.of_slots(links, joints.error)
+        closing = (
+            errors if yielding is None else mechanism_links.of_slots(links, loops.correctable(model, joints.error))
+        )
         wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, closing)
         impulses = mechanism.solve(links, wanted, known)
-        change = mechanism.push(links, impulses)
+        change = mechanism_links.push(links, impulses)
         linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
         assert angular is not None
         moved = moved._replace(velocity=linear, angular_velocity=angular)

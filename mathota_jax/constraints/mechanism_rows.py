@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import mechanism
+from mathota_jax.constraints import mechanism, mechanism_links
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
@@ -43,7 +43,7 @@ class Responses(NamedTuple):
     matrix: Array
 
 
-def responses(links: mechanism.Links, joint_rows: Sequence[Rows], slots: tuple[int, ...]) -> Responses:
+def responses(links: mechanism_links.Links, joint_rows: Sequence[Rows], slots: tuple[int, ...]) -> Responses:
     """The responses to the rows of some slots, which act on nothing but links.
 
     Args:

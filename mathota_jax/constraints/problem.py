@@ -16,8 +16,8 @@ from mathota_jax.constraints import (
     joint,
     joint_layout,
     joint_rows,
-    mechanism,
     mechanism_layout,
+    mechanism_links,
     mechanism_rows,
     row_coefficients,
     substep_rows,
@@ -50,7 +50,7 @@ class Problem(NamedTuple):
     """
 
     joints: joint_rows.JointRows | None
-    held: mechanism.Links | None
+    held: mechanism_links.Links | None
     responses: mechanism_rows.Responses | None
     joint_rows: tuple[Rows, ...]
     contacts: ContactSet | None
@@ -103,7 +103,7 @@ def constrain(
             there = merge(scene, bodies, halfway)
         middle = joint_rows.joint_rows(model, there)
         if mechanism_layout.layout(scene) is not None:
-            held = mechanism.links(scene, middle, moving(scene, there).position, inertia)
+            held = mechanism_links.links(scene, middle, moving(scene, there).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action)
         turning = joint_rows.turning(model, bodies, joints, middle)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia, turning)

@@ -9,7 +9,7 @@ import pytest
 
 from mathota_jax import BallAndSocket, Box, Distance, Fixed, Hinge, SceneBuilder, Slider, Sphere
 from mathota_jax.bodies import moving, moving_inertia, unpack
-from mathota_jax.constraints import mechanism
+from mathota_jax.constraints import mechanism, mechanism_links
 from mathota_jax.constraints.joint_rows import joint_rows
 from mathota_jax.constraints.mechanism_layout import covers, layout
 from tests.scenes import undamped
@@ -61,13 +61,13 @@ def test_impulses_are_those_of_the_dense_matrix(float64, case, gate):
     inertia = moving_inertia(scene, worlds_last, blocks.orientation)
     found = layout(scene)
     assert found is not None and covers(scene)
-    links = mechanism.links(scene, joints, blocks.position, inertia)
+    links = mechanism_links.links(scene, joints, blocks.position, inertia)
 
     rows, count = joints.error.shape[0], len(scene.dynamic_bodies)
     wanted = generator.normal(size=(rows, 2))
-    impulses = mechanism.solve(links, mechanism.of_slots(links, jnp.asarray(wanted)))
-    change = np.asarray(mechanism.push(links, impulses))
-    solved = np.asarray(mechanism.to_slots(links, impulses, rows))
+    impulses = mechanism.solve(links, mechanism_links.of_slots(links, jnp.asarray(wanted)))
+    change = np.asarray(mechanism_links.push(links, impulses))
+    solved = np.asarray(mechanism_links.to_slots(links, impulses, rows))
     ends = {}
     for link in found.links:
         for slot in (*link.slots[0], *link.slots[1]):
@@ -100,7 +100,7 @@ def links_at(model, state):
     bodies = unpack(state)
     blocks = moving(model.scene, bodies)
     inertia = moving_inertia(model.scene, model, blocks.orientation)
-    return mechanism.links(model.scene, joint_rows(model, bodies), blocks.position, inertia)
+    return mechanism_links.links(model.scene, joint_rows(model, bodies), blocks.position, inertia)
 
 
 def in_float64(case):
@@ -135,10 +135,10 @@ def test_worlds_that_differ_by_masses_alone(float64, gate):
     models = dataclasses.replace(model, mass=model.mass * jnp.array([1.0, 3.0]))
     links = links_at(models, state)
     wanted = tuple(jnp.ones((len(links.layout.links), 1)) for _ in range(6))
-    found = mechanism.solve(links, mechanism._held(links, wanted))
+    found = mechanism.solve(links, mechanism_links.only_held(links, wanted))
     for world in range(2):
         alone = links_at(dataclasses.replace(model, mass=models.mass[:, world : world + 1]), state)
-        truth = mechanism.solve(alone, mechanism._held(alone, wanted))
+        truth = mechanism.solve(alone, mechanism_links.only_held(alone, wanted))
         gate("impulses", [np.abs(a[:, world] - b[:, 0]).max() for a, b in zip(found, truth, strict=True)], 1e-12)
 
 

@@ -8,7 +8,7 @@ import scipy.linalg
 
 from mathota_jax import BallAndSocket, Box, Distance, Fixed, Hinge, SceneBuilder, Sphere
 from mathota_jax.bodies import moving, moving_inertia, unpack
-from mathota_jax.constraints import mechanism
+from mathota_jax.constraints import mechanism, mechanism_links
 from mathota_jax.constraints.joint_rows import joint_rows
 from mathota_jax.constraints.mechanism_layout import covers, layout
 from tests.scenes import undamped
@@ -64,11 +64,11 @@ def test_velocities_are_projected(float64, case, gate):
     inertia = moving_inertia(scene, model, blocks.orientation)
     found = layout(scene)
     assert found is not None and found.closings and covers(scene)
-    links = mechanism.links(scene, joints, blocks.position, inertia)
+    links = mechanism_links.links(scene, joints, blocks.position, inertia)
     count, rows = len(scene.dynamic_bodies), joints.error.shape[0]
     velocity = jnp.asarray(np.random.default_rng(0).normal(size=(6, count, 1)))
-    impulses = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism.rates(links, velocity)))
-    left = velocity + mechanism.push(links, impulses)
+    impulses = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism_links.rates(links, velocity)))
+    left = velocity + mechanism_links.push(links, impulses)
 
     # All boxes are upright, so that their principal axes are those of the world.
     masses = np.concatenate(
