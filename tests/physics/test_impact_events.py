@@ -143,7 +143,8 @@ def test_corner_of_a_spinning_box(float64, gate):
     gate("change of the angular momentum", change - impulse * around, 1e-9)
 
     model, state, _ = spinning_box(gap=0.011, restitution=1.0)
-    for count in (5, 50):
+    # The impact keeps the energy; the turns before and after it, of fourth order, change it a little.
+    for count, limit in ((5, 4e-9), (50, 1e-12)):
         final = advance(with_dt(model, 0.05 / count), state, count)
         assert final.velocity[1, 1] > -1.0, "no impact: the test says nothing"
         kinetic = [
@@ -151,7 +152,7 @@ def test_corner_of_a_spinning_box(float64, gate):
             + np.asarray(s.angular_velocity[1]) @ angular_momentum(model, s)
             for s in (state, final)
         ]
-        gate("energy / start - 1", kinetic[1] / kinetic[0] - 1, 1e-9)
+        gate(f"energy / start - 1, {count} steps", kinetic[1] / kinetic[0] - 1, limit)
         gate("horizontal velocity [m/s]", (final.velocity - state.velocity)[1, ::2], 1e-12)
         gate("vertical angular momentum", angular_momentum(model, final)[1] - angular_momentum(model, state)[1], 1e-12)
 
