@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import solve_ivp
 
 from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, contacts, step
 
@@ -169,6 +170,24 @@ def angle_between(p: Any, q: Any) -> np.ndarray:
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
     sign = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0, -1.0, 1.0)
     return 4 * np.arcsin(np.clip(np.linalg.norm(p - sign * q, axis=-1) / 2, 0, 1))
+
+
+def box_moments(half: Any) -> np.ndarray:
+    """Principal moments of inertia (3,) of a box of 1 kg with these half extents [m]."""
+    squares = np.square(half)
+    return (squares.sum() - squares) / 3
+
+
+def torque_free(moments: Any, spin: Any, seconds: float) -> np.ndarray:
+    """Orientation and body angular velocity (7,) of a free body after some time, by Euler's equations and an eighth-order
+    method; it starts upright with angular velocity `spin`."""
+
+    def rates(_: float, y: np.ndarray) -> np.ndarray:
+        turn = 0.5 * quaternion_product(y[:4], np.concatenate([[0.0], y[4:]]))
+        return np.concatenate([turn, -np.cross(y[4:], moments * y[4:]) / moments])
+
+    start = np.concatenate([[1.0, 0.0, 0.0, 0.0], spin])
+    return solve_ivp(rates, (0, seconds), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
 
 
 def invariants(

@@ -4,17 +4,16 @@ import functools
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from mathota_jax import Box, SceneBuilder
 from tests.scenes import (
     advance_worlds,
     angle_between,
     motion,
-    quaternion_product,
     record_worlds,
     rotation_matrix,
     stack,
+    torque_free,
     undamped,
     with_dt,
 )
@@ -31,15 +30,7 @@ FLIP_INTERVAL = {"a": 2.341891, "b": 1.378374}
 
 @functools.cache
 def reference(case):
-    """Euler's equations in the body frame by an eighth-order method."""
-
-    def rates(_, y):
-        orientation, omega = y[:4], y[4:]
-        turn = 0.5 * quaternion_product(orientation, np.concatenate([[0.0], omega]))
-        return np.concatenate([turn, -np.cross(omega, INERTIA * omega) / INERTIA])
-
-    start = np.concatenate([[1.0, 0.0, 0.0, 0.0], SPINS[case]])
-    return solve_ivp(rates, (0, 10), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    return torque_free(INERTIA, SPINS[case], 10)
 
 
 def tumbling_worlds():

@@ -24,8 +24,7 @@ CALLS = 200
 
 
 def measure(settings: Settings) -> dict:
-    """ "worlds": sliding cube, with the error of each batch; "bodies": spheres; "single": one cube, a call
-    and in a loop."""
+    """ "worlds": sliding cube, with the error of each batch; "bodies": spheres; "single": one cube, see `_single`."""
     quick = settings.mode == "quick"
     return {
         "worlds": _worlds(WORLDS[:4] if quick else WORLDS, settings),

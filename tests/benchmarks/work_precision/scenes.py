@@ -9,14 +9,21 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from mathota_jax import Box, Polyhedron, Sphere
 from tests.benchmarks import scenes as closed_forms
 from tests.benchmarks.work_precision.overlap import deepest
 from tests.benchmarks.work_precision.worlds import Body, Motion, World, plane
-from tests.scenes import GRAVITY, angle_between, axis_angle, quaternion_product, rotation_matrix
+from tests.scenes import (
+    GRAVITY,
+    angle_between,
+    axis_angle,
+    box_moments,
+    quaternion_product,
+    rotation_matrix,
+    torque_free,
+)
 
 OURS = ("pgs", "pgs, 30 sweeps", "soft_step", "converged")
 """Settings of the engine that every scene but piles is run with; see `engine.SETTINGS`."""
@@ -150,17 +157,8 @@ def _turned(start: Motion) -> Motion:
 
 @functools.cache
 def tumbled(seconds: float) -> tuple[float, ...]:
-    """Turn of the torque-free box of BENCHMARKS A7a, from Euler's equations (DOP853, relative tolerance 1e-12)."""
-    square = np.array(TUMBLE_HALF) ** 2
-    inertia = (square.sum() - square) / 3
-
-    def rate(_: float, state: np.ndarray) -> np.ndarray:
-        w, omega = state[:4], state[4:]
-        turn = 0.5 * np.concatenate([[-w[1:] @ omega], w[0] * omega + np.cross(w[1:], omega)])
-        return np.concatenate([turn, np.cross(inertia * omega, omega) / inertia])
-
-    start = [1, 0, 0, 0, *TUMBLE_SPIN]
-    found = solve_ivp(rate, (0, seconds), start, method="DOP853", rtol=1e-12, atol=1e-12).y[:4, -1]
+    """Turn of the torque-free box of BENCHMARKS A7a."""
+    found = torque_free(box_moments(TUMBLE_HALF), TUMBLE_SPIN, seconds)[:4]
     return tuple(found / np.linalg.norm(found))
 
 
