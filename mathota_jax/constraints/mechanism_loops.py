@@ -21,8 +21,9 @@ from mathota_jax.constraints.assembly import Side, inner, respond
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import Layout
 from mathota_jax.solver import dense, tree
-from mathota_jax.spatial.indexing import repeat_worlds, take, unstack
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_scaled, repeat_worlds
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.struct import pytree, static
 
@@ -145,20 +146,16 @@ def _forces(found: Layout, sides: tuple[Side, Side], impulses: Array) -> tuple[V
 
 def impulses(loops: Loops, rates: Array) -> Array:
     """Impulses (row, world) that change the rates of the rows, with the trees held, by these."""
-
-    def times(matrix: Array, values: Array) -> Array:
-        return (matrix * values).sum(1)
-
-    found = times(loops.inverse, rates)
+    found = add_scaled(loops.inverse, rates)
     # Where the matrix is all but singular its inverse is large, and so is the round-off.
-    return found + times(loops.inverse, rates - times(loops.matrix, found))
+    return found + add_scaled(loops.inverse, rates - add_scaled(loops.matrix, found))
 
 
 def respond_to(loops: Loops, motion: tree.Pair) -> tree.Pair:
     """Motions (link, 3, world) of trees of which the loops hold as well."""
     wanted = -rates(loops, *(Vec3(*unstack(part, 1)) for part in motion))
     found = impulses(loops, compute_once(wanted, wanted))
-    return jax.tree.map(lambda part, response: part + (response * found).sum(2), motion, loops.responses)
+    return jax.tree.map(lambda part, response: part + add_scaled(response, found), motion, loops.responses)
 
 
 def share_gaps(found: Layout, gaps: Vec3) -> Vec3:

@@ -24,8 +24,9 @@ from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_changes, row_velocity
 from mathota_jax.solver.table import EMPTY
-from mathota_jax.spatial.indexing import repeat_worlds, take
+from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_scaled, repeat_worlds
 
 STIFF = 16
 """Multiples of the machine epsilon, relative to two bodies alone, of the least motion that a tree can be said to allow."""
@@ -56,7 +57,7 @@ def responses(links: mechanism_links.Links, joint_rows: Sequence[Rows], slots: t
     tiled, rows = repeat_worlds((links, tuple(joint_rows)), count, worlds)
     units = jnp.repeat(jnp.eye(count, dtype=links.offset.x.dtype), worlds, axis=1)
     impulse = jnp.zeros((6, block_count, count * worlds), units.dtype)
-    for group, unit in zip(rows, _to_tables(rows, slots, units), strict=True):
+    for group, unit in zip(rows, to_tables(rows, slots, units), strict=True):
         impulse = add_changes(group, Dense((), group.jacobian), impulse, unit)
     velocity = compute_once(mechanism.respond(tiled, impulse), impulse)
     matrix = of_slots(rows, slots, [row_velocity(group, velocity) for group in rows])
@@ -99,11 +100,11 @@ def solve(
     error = of_slots(joint_rows, slots, [group.bias + row_velocity(group, velocity) for group in joint_rows])
     old, first = (of_slots(joint_rows, slots, values) for values in (impulses, start))
     ahead = first - old
-    error = error + (responses.matrix * ahead).sum(1)
+    error = error + add_scaled(responses.matrix, ahead)
     new = _sweep(sweeps, responses.matrix, law, *jnp.broadcast_arrays(first, error))
     change = new - old
-    moved = velocity + (responses.velocity * change).sum(2)
-    return moved, _to_tables(joint_rows, slots, change)
+    moved = velocity + add_scaled(responses.velocity, change)
+    return moved, to_tables(joint_rows, slots, change)
 
 
 def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:
@@ -138,7 +139,7 @@ def leave_stops(
     alone = of_slots(joint_rows, tuple(np.asarray(slots)[stops]), masses)
     law = Bounded(alone, nothing, nothing, nothing + jnp.inf)
     pushes = _sweep(sweeps, matrix, law, nothing, jnp.broadcast_to(error, nothing.shape))
-    return (responses.velocity[:, :, stops] * pushes).sum(2)
+    return add_scaled(responses.velocity[:, :, stops], pushes)
 
 
 def of_slots(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Sequence[Array]) -> Array:
@@ -149,7 +150,7 @@ def of_slots(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Sequenc
     return take(collect(tables, full, _slot_count(joint_rows)), np.asarray(slots))
 
 
-def _to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array) -> tuple[Array, ...]:
+def to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array) -> tuple[Array, ...]:
     """(turn, 1, column, world) for all tables from (row, world), 0 for other slots."""
     place = np.full(_slot_count(joint_rows), len(slots))
     place[np.asarray(slots)] = np.arange(len(slots))

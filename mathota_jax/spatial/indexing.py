@@ -84,8 +84,3 @@ def unstack(array: Array, axis: int) -> list[Array]:
 def in_every_world(tree: Any, worlds: int) -> Any:
     """Arrays (..., world or 1) of a pytree with as many worlds as given."""
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], worlds)), tree)
-
-
-def repeat_worlds(tree: Any, count: int, worlds: int) -> Any:
-    """Copies of all worlds, one for each of some things to be done in all of them; what worlds share stays so."""
-    return jax.tree.map(lambda x: x if x.shape[-1] < worlds or worlds == 1 else jnp.tile(x, count), tree)

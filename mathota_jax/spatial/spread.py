@@ -41,11 +41,29 @@ def for_each(count: int, tree: Any) -> Any:
     return jax.tree.map(lambda x: spread(x[None], (count, *x.shape)), tree)
 
 
+def repeat_worlds(tree: Any, count: int, worlds: int) -> Any:
+    """Copies of all worlds, one for each of some things to be done in all of them; what worlds share stays so."""
+
+    def repeat(x: Array) -> Array:
+        if x.shape[-1] < worlds or worlds == 1:
+            return x
+        return spread(x[..., None, :], (*x.shape[:-1], count, worlds)).reshape(*x.shape[:-1], count * worlds)
+
+    return jax.tree.map(repeat, tree)
+
+
 def add_slices(array: Array, axis: int) -> Array:
     """Sum along a short axis, which is removed."""
     axis %= array.ndim
     total = array if array.shape[axis] == 1 else _add_slices_p.bind(array, axis=axis)
     return jnp.squeeze(total, axis)
+
+
+def add_scaled(values: Array, factors: Array) -> Array:
+    """Sum (..., world) of some values (..., term, world), each times its factor (term, world)."""
+    factors = factors.reshape(*(1,) * (values.ndim - 2), *factors.shape)
+    terms = values * spread(factors, values.shape)
+    return add_slices(terms, -2) if values.shape[-2] <= FEW_SLICES else terms.sum(-2)
 
 
 def add_all_slices(array: Array) -> Array:

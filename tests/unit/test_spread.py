@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from mathota_jax.spatial.spread import FEW_SLICES, add_all_slices, add_slices, greatest, largest_slice, least, spread
+from mathota_jax.spatial.spread import (
+    FEW_SLICES,
+    add_all_slices,
+    add_scaled,
+    add_slices,
+    greatest,
+    largest_slice,
+    least,
+    repeat_worlds,
+    spread,
+)
 
 
 def product(matrix, vector):
@@ -55,3 +65,22 @@ def test_extremes_along_the_leading_axis(float64, count):
     values = np.random.default_rng(1).normal(size=(count, 2, 5))
     np.testing.assert_array_equal(greatest(jnp.asarray(values)), values.max(0))
     np.testing.assert_array_equal(least(jnp.asarray(values)), values.min(0))
+
+
+@pytest.mark.parametrize("count", [1, 4, FEW_SLICES + 1])
+@pytest.mark.parametrize("shared", [False, True])
+def test_sum_of_scaled_values(float64, count, shared):
+    rng = np.random.default_rng(2)
+    values, factors = rng.normal(size=(3, 2, count, 1 if shared else 5)), rng.normal(size=(count, 5))
+    truth = np.einsum("abnw,nw->abw", np.broadcast_to(values, (3, 2, count, 5)), factors)
+    np.testing.assert_allclose(add_scaled(jnp.asarray(values), jnp.asarray(factors)), truth, rtol=1e-13, atol=1e-13)
+    if not shared:
+        check_grads(add_scaled, (values, factors), order=1, rtol=1e-8)
+
+
+def test_repeated_worlds(float64):
+    own, of_all = np.random.default_rng(3).normal(size=(3, 2, 5)), np.ones((3, 1))
+    found = repeat_worlds((jnp.asarray(own), jnp.asarray(of_all)), 4, 5)
+    np.testing.assert_array_equal(found[0], np.tile(own, 4))
+    assert found[1].shape == (3, 1)
+    check_grads(lambda x: repeat_worlds(x, 4, 5), (own,), order=1, rtol=1e-8)
