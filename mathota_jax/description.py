@@ -10,7 +10,7 @@ from mathota_jax import measured
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
-from mathota_jax.constraints.mechanism_layout import layout
+from mathota_jax.constraints.mechanism_layout import layout, takes_contacts
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -101,6 +101,7 @@ def _features(scene: Scene) -> list[str]:
         "steps split at impacts": bool(scene.options.impact_events and scene.restitution and scene.pair_groups),
         "joints": bool(scene.joints),
         "exact joints": layout(scene) is not None,
+        "contacts with the joints held": takes_contacts(scene),
         "gyroscopic torque": not all(scene.spherical[body] for body in scene.dynamic_bodies),
         "linear damping": options.linear_damping > 0,
         "angular damping": options.angular_damping > 0,

@@ -64,9 +64,11 @@ class Options:
         ``load / (2 effective mass * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`,
         `baumgarte` and `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its
         restitution pass. All figures: docs/solvers.md.
-      exact_joints: three or more joints that are connected, trees and closed loops, are solved together, exactly, and closed
-        at the end of the step (not with `impact_events`), and fewer where a scene has nothing else to solve ("soft_step":
-        there alone); one or two beside contacts or limits, and nets whose loops more than 96 rows close, are left to the
+      exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the end of
+        the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot stands on feet
+        of any mass, where there are up to 96 rows of contacts, motors, friction and stops together, no broadphase, and no
+        other joints. Elsewhere three and more joints, or fewer where a scene has nothing else to solve ("soft_step": there
+        alone); one or two beside several contacts that bounce, and nets whose loops more than 96 rows close, are left to the
         solver. Off: absent. Limits, motors, springs and friction on their joints are solved with all that hangs on them, by
         `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred times as heavy as its first
         link, a stop or a spring acts as it would on one rigid body.

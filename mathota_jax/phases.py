@@ -18,6 +18,7 @@ from mathota_jax.constraints import (
     joint_rows,
     loops,
     mechanism,
+    mechanism_contacts,
     mechanism_correction,
     mechanism_links,
     mechanism_rows,
@@ -121,6 +122,8 @@ def _solve_mechanisms(
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """`solve_rows` where there are mechanisms and other rows: what the former hold, holds exactly in the end."""
     rows = problem.rows
+    if problem.reduced is not None:
+        return *_solve_reduced(scene, problem, problem.reduced, held, velocity, start), None
 
     def hold(velocity: Array, impulses: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         return mechanism.hold(held, problem.joint_rows, velocity, impulses)[:2]
@@ -146,6 +149,25 @@ def _solve_mechanisms(
     joints = tuple(old + more for old, more in zip(joints, change, strict=True))
     _, joints = hold(add_impulses(problem.joint_rows, velocity, change), joints)
     return moved, (*joints, *others), failed
+
+
+def _solve_reduced(
+    scene: Scene,
+    problem: Problem,
+    reduced: mechanism_contacts.Reduced,
+    held: mechanism_links.Links,
+    velocity: Array,
+    start: tuple[Array, ...],
+) -> tuple[Array, tuple[Array, ...]]:
+    """The same where contacts, too, act on mechanisms as wholes."""
+    nothing = tuple(jnp.zeros_like(impulse) for impulse in start)
+    free = mechanism.hold(held, problem.joint_rows, velocity, nothing)[0]
+    first = lax.stop_gradient(mechanism_contacts.to_reduced(scene, problem.joint_rows, start))
+    found = _sweep(scene, reduced.rows, reduced.rates(free), first, known=False)[1]
+    impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, found)
+    # What the joints take for it; the velocity is known better than their large impulses on light links would have it.
+    moved = free + reduced.change(found)
+    return moved, mechanism.hold(held, problem.joint_rows, add_impulses(problem.rows, velocity, impulses), impulses)[1]
 
 
 def _impulses(
@@ -213,6 +235,9 @@ def correct_positions(
         if problem.responses is not None and covers_with_bounds(scene):
             # What holds is closed at the end of the step.
             return moved if back is None else displace(moved, inertia, back)
+        if problem.reduced is not None:
+            shift = _leave_contacts(scene, problem, problem.reduced, packed)
+            return displace(moved, inertia, shift if back is None else shift + back)
         rows += [
             joint.position_rows(scene, group.table, problem.joints, error, inertia, bounded)
             if how is None
@@ -231,6 +256,18 @@ def correct_positions(
         gradient = _gradient_iterations(scene, tuple(rows), iterations)
         correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start, zero)
     return displace(moved, inertia, correction if back is None else correction + back)
+
+
+def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.Reduced, displacement: Array) -> Array:
+    """Displacement (component, block, world) out of what overlaps, of mechanisms as wholes."""
+    percent, iterations = scene.options.position_percent, scene.options.position_iterations
+    contacts = [contact.position_rows(group, displacement, percent) for group in problem.contact_rows]
+    rows, velocity = mechanism_contacts.normal_rows(reduced, contacts)
+    worlds = max(velocity.shape[-1], *(group.bias.shape[-1] for group in rows))
+    start = tuple(jnp.zeros_like(group.bias) for group in rows)
+    still = jnp.zeros((velocity.shape[2], 1, worlds), velocity.dtype)
+    found = pgs.solve(iterations, _gradient_iterations(scene, rows, iterations), rows, still, start, still)[1]
+    return mechanism_contacts.change(velocity, found)
 
 
 def close_joints(

@@ -192,7 +192,7 @@ def contact_rows(
         )
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
-        law = _push_only(mass[:, None])
+        law = push_only(mass[:, None])
     rows = Rows(
         matrix=matrix,
         bias=pack_scalars(table, bias, worlds),
@@ -291,7 +291,8 @@ def rows_one_by_one(
     )
 
 
-def _push_only(effective_mass: Array) -> Push:
+def push_only(effective_mass: Array) -> Push:
+    """The law of contacts without friction, from effective masses (turn, 1, column, world)."""
     zero = jnp.zeros((1,) * effective_mass.ndim, effective_mass.dtype)
     shape = (effective_mass.shape[0], 1, 1, 1)
     return Push(
@@ -364,6 +365,6 @@ def position_rows(contact: ContactRows, displacement: Array, percent: float) -> 
         error = jnp.maximum(separation + change, jnp.minimum(separation, -size)) + slop
         return jnp.where(error < 0, percent * error, error)
 
-    firsts = dataclasses.replace(rows, matrix=first, law=_push_only(normal_mass(rows)))
+    firsts = dataclasses.replace(rows, matrix=first, law=push_only(normal_mass(rows)))
     levels = (contact.separation, contact.slop, contact.size)
     return dataclasses.replace(firsts, bias=map_turns(bias, firsts, levels))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import JointGroup, joint_groups, joint_row_count
 from mathota_jax.scene import Scene
 from mathota_jax.solver.tree import GROUND, Tree
@@ -15,8 +16,12 @@ from mathota_jax.solver.tree import GROUND, Tree
 _Slots = tuple[tuple[int, ...], tuple[int, ...]]
 
 LEAST_JOINTS = 3
-"""Joints of the smallest mechanism beside other rows: two converge in a few sweeps, which are cheaper. Where there are no
-others, no sweep is needed at all, and one joint is enough."""
+"""Joints of the smallest mechanism beside rows that are swept in turn with it: two converge in a few sweeps, which are
+cheaper. Elsewhere one is enough."""
+
+MOST_ROWS = 96
+"""Rows of contacts and with bounds of the largest scene in which they are solved with the joints held: the matrix grows with
+their square."""
 
 MOST_CLOSING = 96
 """Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
@@ -122,7 +127,9 @@ def layout(scene: Scene) -> Layout | None:
     if options.impact_events or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
-    if found is not None and _has_no_others(scene, found):
+    # Rebounds that gain energy are cut only where no joints are solved as trees.
+    with_contacts = found is not None and not scene.rebounds_together and _takes_contacts(scene, found)
+    if found is not None and (with_contacts or _has_no_others(scene, found)):
         return found
     return None if options.solver == "soft_step" else _of_trees(scene, LEAST_JOINTS)
 
@@ -166,6 +173,17 @@ def _has_no_others(scene: Scene, found: Layout) -> bool:
     return not scene.slot_count and _row_count(found) == joint_row_count(scene)
 
 
+def _takes_contacts(scene: Scene, found: Layout) -> bool:
+    if scene.options.solver != "pgs" or scene.broadphase is not None or not scene.slot_count:
+        return False
+    bounded, tables = _bounded_slots(scene, found), contact_tables(scene)
+    if _row_count(found) + len(bounded) != joint_row_count(scene):
+        return False
+    on_links = any(set(found.blocks) & set(blocks) for table in tables for side in table.blocks for blocks in side)
+    columns = sum(table.turn_count * table.column_count for table in tables)
+    return on_links and len(bounded) + columns * (3 if scene.friction else 1) <= MOST_ROWS
+
+
 def _row_count(found: Layout) -> int:
     return len(found.slots) + len(found.closing_slots)
 
@@ -202,11 +220,20 @@ def covers_with_bounds(scene: Scene) -> bool:
 
 
 @functools.cache
+def takes_contacts(scene: Scene) -> bool:
+    """Whether all contacts of a scene, and all joint rows but those that always hold, are solved with the joints held."""
+    found = layout(scene)
+    return found is not None and _takes_contacts(scene, found)
+
+
+@functools.cache
 def bounded_slots(scene: Scene) -> tuple[int, ...]:
     """Slots of the rows with bounds, or soft ones, that act on nothing but links."""
     found = layout(scene)
-    if found is None:
-        return ()
+    return () if found is None else _bounded_slots(scene, found)
+
+
+def _bounded_slots(scene: Scene, found: Layout) -> tuple[int, ...]:
     block_of = {body: block for block, body in enumerate(scene.dynamic_bodies)}
     links = set(found.blocks)
     slots = [

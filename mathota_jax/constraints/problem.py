@@ -16,6 +16,7 @@ from mathota_jax.constraints import (
     joint,
     joint_layout,
     joint_rows,
+    mechanism_contacts,
     mechanism_layout,
     mechanism_links,
     mechanism_rows,
@@ -59,6 +60,7 @@ class Problem(NamedTuple):
     errors: tuple[PositionError, ...] = ()
     decouplings: tuple[Decoupling, ...] = ()
     offsets: Vec3 | None = None
+    reduced: mechanism_contacts.Reduced | None = None
 
     @property
     def of_joint_rows(self) -> tuple[Decoupling | None, ...]:
@@ -143,7 +145,12 @@ def constrain(
         offsets = contact_offsets(model, bodies, contacts, close)
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
-    return Problem(joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings, offsets)
+    reduced = None
+    if held is not None and mechanism_layout.takes_contacts(scene):
+        reduced = mechanism_contacts.reduce(scene, held, tables, [group.rows for group in contact_rows])
+    return Problem(
+        joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings, offsets, reduced
+    )
 
 
 def starting_impulses(

@@ -42,8 +42,18 @@ def test_what_a_scene_has():
     assert found["broadphase"] == "none"
     present, absent = (set(found[key].split(", ")) for key in ("present", "absent"))
     assert {"friction", "joints", "warm start", "linear damping", "gyroscopic torque"} <= present
-    assert absent == {"restitution", "sleep", "continuous collision", "exact joints", "steps split at impacts"}
+    assert absent == {"restitution", "sleep", "continuous collision", "steps split at impacts"}
     assert "dt=0.0166667" in found["settings"] and "velocity_iterations=10" in found["settings"]
+
+
+def test_a_robot_on_the_ground():
+    builder = SceneBuilder()
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True)
+    links = [builder.add_body(Sphere(0.1), mass=1.0, position=(0.3 * k, 0.1, 0)) for k in range(4)]
+    for k in range(3):
+        builder.add_joint(Hinge(links[k], links[k + 1], (0.3 * k + 0.15, 0.1, 0), (0, 0, 1)))
+    present = lines(builder.build()[0])["present"].split(", ")
+    assert "exact joints" in present and "contacts with the joints held" in present
 
 
 def test_what_a_scene_lacks():

@@ -1,0 +1,298 @@
+"""Contacts of mechanisms, and rows with bounds on their joints: solved together, in a space in which the joints hold.
+
+An impulse on a link moves the whole tree. Swept in turn with the rows that hold, a contact finds the inertia of the tree
+only after as many sweeps as the tree is heavier than the link: a robot sinks through the ground on its light feet. Here the
+response of everything to each row is found first (`solver.tree`, all rows side by side as if they were worlds). What the
+sweeps then act on is not the velocities of bodies but the rates of the rows, one block of as many components as there are
+rows: the Jacobian of a row picks its own rate, its response is its column of the matrix ``J M^-1 J^T`` with the joints held.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from mathota_jax.constraints import contact, mechanism, mechanism_links
+from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
+from mathota_jax.constraints.mechanism_layout import bounded_slots
+from mathota_jax.constraints.mechanism_rows import of_slots, own_mass, to_tables
+from mathota_jax.scene import Scene
+from mathota_jax.solver import pgs
+from mathota_jax.solver.laws import Bounded, Cone
+from mathota_jax.solver.row_matrix import Dense, Entries
+from mathota_jax.solver.rows import Rows
+from mathota_jax.solver.table import Table
+from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_scaled, add_slices, repeat_worlds, spread
+
+LARGEST_STEP = 1.9
+"""Bound of the eigenvalues of the matrix of a constraint times its steps; sweeps diverge at 2."""
+
+
+class _Sides(NamedTuple):
+    """Jacobian and response (component, row, world) of rows on one of their sides, and velocity blocks."""
+
+    jacobian: Array
+    response: Array
+    blocks: tuple[int, ...]
+
+
+class Reduced(NamedTuple):
+    """The rows of a step, reduced.
+
+    Attributes:
+      sides: the rows on single bodies.
+      velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
+      matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
+      rows: one group for the rows with bounds on joints, if there are any, then one for each group of contacts.
+    """
+
+    sides: tuple[_Sides, ...]
+    velocity: Array
+    matrix: Array
+    rows: tuple[Rows, ...]
+
+    def rates(self, velocity: Array) -> Array:
+        """Rates (row, 1, world) of the velocities (component, block, world)."""
+        return _rates(self.sides, velocity[:, :, None])
+
+    def change(self, impulses: Sequence[Array]) -> Array:
+        """What impulses of the reduced groups change, with the joints held; (component, block, world)."""
+        return change(self.velocity, impulses)
+
+
+def reduce(scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows], contacts: Sequence[Rows]) -> Reduced:
+    """The rows of a scene whose mechanisms take contacts, from those that act on single bodies."""
+    worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in (*joint_rows, *contacts))))
+    sides = _sides(scene, joint_rows, contacts, worlds)
+    count, block_count = len(sides[0].blocks), links.layout.block_count
+    force = _of_blocks([side.jacobian for side in sides], sides, block_count)
+    tiled = repeat_worlds(links, count, worlds)
+    velocity = mechanism.respond(tiled, force.reshape(*force.shape[:2], -1)).reshape(force.shape)
+    if len(links.layout.links) < block_count:
+        is_link = np.isin(np.arange(block_count), links.layout.blocks)[:, None, None]
+        velocity = jnp.where(is_link, velocity, _of_blocks([side.response for side in sides], sides, block_count))
+    velocity = compute_once(velocity, velocity)
+    matrix = _rates(sides, velocity)
+    matrix = compute_once(matrix, matrix)
+    bounded = bounded_slots(scene)
+    rows, first = [], len(bounded)
+    if bounded:
+        rows.append(_joint_group(joint_rows, bounded, matrix))
+    for group in contacts:
+        rows.append(_contact_group(group, matrix, first))
+        first += group.bias[..., 0].size
+    return Reduced(sides, velocity, matrix, tuple(rows))
+
+
+def to_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
+    """Values of all groups (turn, row, column, world), in the order of the reduced ones."""
+    bounded = bounded_slots(scene)
+    joints, contacts = values[: len(joint_rows)], values[len(joint_rows) :]
+    found = [of_slots(joint_rows, bounded, joints)[:, None, None]] if bounded else []
+    tables = contact.contact_tables(scene)
+    return (*found, *(_by_constraint(table, value) for table, value in zip(tables, contacts, strict=True)))
+
+
+def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
+    """The reverse; 0 for rows that always hold."""
+    bounded = bounded_slots(scene)
+    worlds = max(value.shape[-1] for value in values)
+    if bounded:
+        joints = to_tables(joint_rows, bounded, values[0][:, 0, 0])
+    else:
+        joints = tuple(jnp.zeros((*group.bias.shape[:-1], worlds), group.bias.dtype) for group in joint_rows)
+    tables = contact.contact_tables(scene)
+    contacts = values[len(values) - len(tables) :]
+    return (*joints, *(_by_turn(table, value) for table, value in zip(tables, contacts, strict=True)))
+
+
+def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows, ...], Array]:
+    """Groups for the normals of the contacts alone, with the biases of `contacts`; the velocity under a unit impulse."""
+    groups = reduced.rows[len(reduced.rows) - len(contacts) :]
+    first = len(reduced.matrix) - sum(group.bias[..., 0].size for group in groups)
+    numbers = []
+    for group in groups:
+        turns, rows, points = group.bias.shape[:3]
+        numbers.append(first + np.arange(turns * rows * points).reshape(turns, points, rows)[:, :, 0].reshape(-1))
+        first += turns * rows * points
+    chosen = np.concatenate(numbers)
+    matrix = reduced.matrix[chosen][:, chosen]
+    found, first = [], 0
+    for group in contacts:
+        found.append(_contact_group(group, matrix, first))
+        first += group.bias[..., 0].size
+    return tuple(found), reduced.velocity[:, :, chosen]
+
+
+def change(velocity: Array, impulses: Sequence[Array]) -> Array:
+    """(component, block, world) from those under unit impulses of rows (component, block, row, world), and impulses."""
+    in_order = [jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in impulses]
+    return add_scaled(velocity, jnp.concatenate(in_order))
+
+
+def _sides(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows], worlds: int) -> tuple[_Sides, ...]:
+    """All rows that do not always hold."""
+    slots = np.concatenate([group.table.order for group in joint_rows])
+    place_of = {slot: place for place, slot in enumerate(slots.tolist())}
+    count = len(slots) + sum(group.bias[..., 0].size for group in contacts)
+    places = np.array([*(place_of[slot] for slot in bounded_slots(scene)), *range(len(slots), count)])
+    found = []
+    for side in range(2):
+        parts = [_side(group, side, worlds) for group in (*joint_rows, *contacts)]
+        blocks = np.array([block for part in parts for block in part.blocks])
+        jacobian, response = (
+            take(jnp.concatenate(values, axis=1), places, axis=1)
+            for values in ([part.jacobian for part in parts], [part.response for part in parts])
+        )
+        found.append(_Sides(jacobian, response, tuple(blocks[places].tolist())))
+    return tuple(found)
+
+
+def _side(group: Rows, side: int, worlds: int) -> _Sides:
+    """The rows of a group, in the order turn, column, row; of a side that it does not have 0, past the last block."""
+    table, rows = group.table, group.bias.shape[1]
+    matrix = group.matrix.dense()
+    if side >= len(matrix.jacobian):
+        nothing = jnp.zeros((matrix.jacobian[0].shape[2], table.order.size * rows, worlds), matrix.like.dtype)
+        return _Sides(nothing, nothing, (table.block_count,) * (table.order.size * rows))
+
+    def flat(values: Array) -> Array:
+        ordered = values.transpose(2, 0, 3, 1, 4).reshape(values.shape[2], -1, values.shape[-1])
+        return jnp.broadcast_to(ordered, (*ordered.shape[:2], worlds))
+
+    blocks = tuple(block for turn in table.blocks[side] for block in turn for _ in range(rows))
+    return _Sides(flat(matrix.jacobian[side]), flat(matrix.response[side]), blocks)
+
+
+def _of_blocks(values: Sequence[Array], sides: Sequence[_Sides], block_count: int) -> Array:
+    """(component, block, row, world) from (component, row, world) of each side."""
+    numbers = np.arange(block_count)[:, None]
+    shape = (len(values[0]), block_count, *values[0].shape[1:])
+    parts = [
+        jnp.where((np.asarray(side.blocks) == numbers)[..., None], spread(part[:, None], shape), 0.0)
+        for part, side in zip(values, sides, strict=True)
+    ]
+    return functools.reduce(jnp.add, parts)
+
+
+def _rates(sides: Sequence[_Sides], velocity: Array) -> Array:
+    """(row, column, world) of the velocities (component, block, column, world)."""
+    found = []
+    for side in sides:
+        at = take(velocity, np.minimum(side.blocks, velocity.shape[1] - 1), axis=1)
+        shape = (*side.jacobian.shape[:2], *at.shape[2:])
+        found.append(add_slices(spread(side.jacobian[:, :, None], shape) * spread(at, shape), 0))
+    return functools.reduce(jnp.add, found)
+
+
+def _group(table: Table, law: Bounded | Cone, bias: Array, matrix: Array, first: int) -> Rows:
+    """Rows that start at `first`, one constraint a turn."""
+    turns, rows, points = bias.shape[:3]
+    count = len(matrix)
+
+    def by_turn(values: Array) -> Array:
+        chosen = values[:, first : first + turns * rows * points]
+        return chosen.reshape(count, turns, points, rows, -1).transpose(1, 3, 0, 2, 4)
+
+    own = by_turn(jnp.eye(count, dtype=matrix.dtype)[..., None])
+    return Rows(Dense((own,), (by_turn(matrix),)), bias, law, table)
+
+
+def _one_a_turn(turns: int, points: int) -> Table:
+    slots = tuple(tuple(range(points * turn, points * (turn + 1))) for turn in range(turns))
+    return Table(slots, (((0,) * points,) * turns,), 1, points)
+
+
+def _joint_group(joint_rows: Sequence[Rows], bounded: tuple[int, ...], matrix: Array) -> Rows:
+    law = jax.tree.map(lambda *parts: of_slots(joint_rows, bounded, parts), *(group.law for group in joint_rows))
+    bias = of_slots(joint_rows, bounded, [group.bias for group in joint_rows])
+    works = law.effective_mass > 0
+    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(bounded)))
+    mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
+    law = Bounded(mass, law.softness, law.lower, law.upper)
+    law, bias = jax.tree.map(lambda x: jnp.broadcast_to(x, mass.shape)[:, None, None], (law, bias))
+    return _group(_one_a_turn(len(bounded), 1), law, bias, matrix, 0)
+
+
+def _contact_group(group: Rows, matrix: Array, first: int) -> Rows:
+    table = group.table
+    bias = _by_constraint(table, group.bias)
+    turns, rows, points = bias.shape[:3]
+    size = rows * points
+    starts = [first + size * turn for turn in range(turns)]
+    own = jnp.stack([matrix[start : start + size, start : start + size] for start in starts])
+    own = lax.stop_gradient(own).reshape(turns, size, points, rows, -1)
+
+    def of_points(values: Array) -> Array:
+        return values.reshape(turns, points, values.shape[-1])
+
+    law = group.law
+    mass = of_points(law.normal_mass if isinstance(law, Cone) else law.effective_mass)
+    active = jnp.broadcast_to(jnp.where(mass > 0, 1.0, 0.0), (turns, points, own.shape[-1])).astype(own.dtype)
+    entries = _entries(own)
+    normal = safe_divide(active, normal_bound(entries, points, active))
+    if not isinstance(law, Cone):
+        return _group(_one_a_turn(turns, points), contact.push_only(normal[:, None]), bias, matrix, first)
+    tangent = safe_divide(active, tangent_bound(entries, points, active))
+    share = _convergent(own, normal, tangent, active)
+    grip = None if law.first_grip is None else of_points(law.first_grip)
+    law = Cone(normal * share, tangent * share, of_points(law.friction), grip)
+    return _group(_one_a_turn(turns, points), law, bias, matrix, first)
+
+
+def _entries(own: Array) -> tuple[Entries, Entries]:
+    """Two matrices whose product is (turn, row, point, row of the point, world): the unit matrix, and itself."""
+    turns, size, points, rows, worlds = own.shape
+    units = np.eye(size).reshape(size, 1, points, rows, 1)
+    unit = jnp.broadcast_to(jnp.asarray(units, own.dtype), (size, turns, points, rows, worlds))
+    return tuple(  # type: ignore[return-value]
+        [[[values[m, :, :, row] for m in range(size)] for row in range(rows)]]
+        for values in (unit, jnp.moveaxis(own, 1, 0))
+    )
+
+
+def _convergent(own: Array, normal: Array, tangent: Array, active: Array) -> Array:
+    """Share (turn, 1, world) of the steps of a constraint with which its sweeps converge; usually 1.
+
+    Its rows see the errors before the turn. Where a body is much taller than wide, a push along the normal of a point turns
+    it as a pull along the tangents does, and the two steps add up. The largest eigenvalue of the matrix of all rows, times
+    their steps, must be below 2 (the bound is that of `normal_bound`). As many are not 0 as two rigid bodies have ways to
+    move at their points against each other: three at one, five at two, six at more.
+
+    Args:
+        own: (turn, row, point, row of the point, world) the matrix of the rows of each constraint.
+        normal, tangent: (turn, point, world) effective masses.
+        active: (turn, point, world) 1 for points that touch, else 0.
+    """
+    turns, size, *_, worlds = own.shape
+    steps = jnp.stack([pgs.OVER_RELAXATION * normal, tangent, tangent], axis=2).reshape(turns, size, 1, worlds)
+    matrix = own.reshape(turns, size, size, worlds)
+    trace = functools.reduce(jnp.add, [matrix[:, row, row] * steps[:, row, 0] for row in range(size)])
+    norm = add_slices(add_slices(matrix * matrix * steps * jnp.swapaxes(steps, 1, 2), 1), 1)
+    points = add_slices(active, 1)
+    rank = jnp.where(points > 2.0, 6.0, jnp.where(points > 1.0, 5.0, 3.0))
+    bound = (trace + safe_sqrt(jnp.maximum((rank - 1.0) * (rank * norm - trace * trace), 0.0))) / rank
+    return jnp.minimum(1.0, safe_divide(jnp.full_like(bound, LARGEST_STEP), bound))[:, None]
+
+
+def _by_constraint(table: Table, values: Array) -> Array:
+    """(turn * constraint, row, point, world) from (turn, row, column, world)."""
+    turns, rows, columns, worlds = values.shape
+    split = values.reshape(turns, rows, columns // table.together, table.together, worlds)
+    return jnp.moveaxis(split, 1, 2).reshape(-1, rows, table.together, worlds)
+
+
+def _by_turn(table: Table, values: Array) -> Array:
+    """The reverse."""
+    _, rows, points, worlds = values.shape
+    split = values.reshape(table.turn_count, -1, rows, points, worlds)
+    return jnp.moveaxis(split, 2, 1).reshape(table.turn_count, rows, -1, worlds)

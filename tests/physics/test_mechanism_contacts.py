@@ -1,0 +1,144 @@
+"""Trees of joints that stand, slide and walk on feet far lighter than what they carry. Closed forms: statics, friction."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mathota_jax import Box, Fixed, Hinge, Plane, SceneBuilder, Sphere, contact_forces, joint_gaps, rollout
+from mathota_jax.constraints import mechanism_layout
+from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.scenes import DOWN, GRAVITY, undamped
+
+UP = (0.0, 1.0, 0.0)
+LIGHT = (0.2, 2.0, 5.0, 50.0)
+"""Masses of a foot and of what stands on it."""
+
+
+def leg(builder, masses, foot=(0.1, 0.02, 0.1), speed=0.0, friction=0.5):
+    """Blocks welded on top of each other, the first a foot on the ground; handles."""
+    bodies, level = [], 0.0
+    for mass in masses:
+        half = (0.05, 0.1, 0.05) if bodies else foot
+        body = builder.add_body(
+            Box(half),
+            mass=mass,
+            position=(0, level + half[1], 0),
+            velocity=(speed, 0, 0),
+            friction=friction,
+            collides=not bodies,
+        )
+        if bodies:
+            builder.add_joint(Fixed(bodies[-1], body, (0, level, 0)))
+        bodies.append(body)
+        level += 2 * half[1]
+    return bodies
+
+
+def on_ground(friction=0.5):
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane(UP), static=True, friction=friction)
+    return builder
+
+
+@jax.jit
+def stand(model, state):
+    """120 steps; one program for all masses and time steps."""
+    return rollout(model, state, 120)[0]
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
+@pytest.mark.parametrize(
+    "masses",
+    [LIGHT, (0.002, *LIGHT[1:]), (20.0, 2.0, 1.0, 0.5), (0.2, 50.0)],
+    ids=["light", "tiny", "heavy", "of one joint"],
+)
+def test_a_leg_stands_on_its_foot(precision, masses, dt, gate):
+    """A tower of 57 kg on 0.2 kg fell through the ground; where it is slender, rows that pushed at once made it rock."""
+    builder = on_ground()
+    leg(builder, masses)
+    model, state = builder.build(undamped(dt=dt))
+    assert mechanism_layout.takes_contacts(model.scene)
+    final = stand(model, state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), 1e-5)
+    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-5)
+    borne = np.asarray(contact_forces(model, final), float)[:, 1].sum()
+    gate("borne by the ground / weight - 1", abs(borne) / (GRAVITY * sum(masses)) - 1, 1e-5)
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_leg_carries_a_free_ball(precision, gate):
+    """Rows of bodies that are no links are part of the same system."""
+    builder = on_ground()
+    last = leg(builder, LIGHT)[-1]
+    plate = builder.add_body(Box((0.1, 0.02, 0.1)), mass=0.5, position=(0, 0.66, 0))
+    builder.add_joint(Fixed(last, plate, (0, 0.64, 0)))
+    builder.add_body(Sphere(0.1), mass=20.0, position=(0, 0.78, 0))
+    model, state = builder.build(undamped(dt=1 / 60))
+    assert mechanism_layout.takes_contacts(model.scene)
+    final = stand(model, state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), 2e-5)
+    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
+    gate("borne by ground and plate / truth - 1", borne / (GRAVITY * (sum(LIGHT) + 0.5 + 2 * 20.0)) - 1, 1e-4)
+
+
+def slide(speed=2.0, friction=0.25, dt=1 / 60, steps=24):
+    """A welded sled whose foot is wide enough not to tip; all the way it slides. The usual sweeps leave 6.5e-4 of it."""
+    builder = on_ground(friction)
+    bodies = leg(builder, (0.2, 2.0, 5.0, 10.0), (0.6, 0.02, 0.3), speed, friction)
+    model, state = builder.build(undamped(dt=dt, velocity_iterations=40))
+    assert mechanism_layout.takes_contacts(model.scene)
+    return model, state, bodies, steps * dt, steps
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_sled_slides_as_one_body(precision, gate):
+    """``v t - mu g t^2 / 2``: exact for one body, whose friction is that of the load."""
+    model, state, bodies, time, steps = slide()
+    final = jax.jit(lambda state: rollout(model, state, steps)[0])(state)
+    way = np.asarray(final.position - state.position, float)[bodies, 0]
+    truth = 2.0 * time - 0.25 * GRAVITY * time**2 / 2
+    gate("way / truth - 1", way / truth - 1, 1e-4)
+    gate("joint gaps [m]", np.asarray(joint_gaps(model, final).translation, float), 1e-6)
+
+
+def test_derivatives_of_a_sled(float64, gate):
+    """By the speed, the coefficients of friction and gravity, in both modes."""
+    model, state, bodies, time, steps = slide()
+
+    def way(speed, friction, gravity):
+        moving = state.velocity.at[jnp.asarray(bodies), 0].set(speed)
+        changed = dataclasses.replace(
+            model,
+            friction=jnp.full_like(model.friction, friction),
+            gravity=jnp.asarray([0.0, -1.0, 0.0]) * gravity,
+        )
+        return rollout(changed, dataclasses.replace(state, velocity=moving), steps)[0].position[bodies[-1], 0]
+
+    at = (2.0, 0.25, GRAVITY)
+    truth = np.array([time, -GRAVITY * time**2 / 2, -0.25 * time**2 / 2])
+    for name, mode in (("reverse", jax.jacrev), ("forward", jax.jacfwd)):
+        found = np.asarray(jax.jit(mode(way, (0, 1, 2)))(*at))
+        gate(f"{name} / truth - 1", found / truth - 1, 1e-4)
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_table_on_driven_legs(precision, gate):
+    """Legs that motors hold still bear the weight; they may share it as they like. The usual sweeps move it by 0.3 mm."""
+    builder = on_ground()
+    top = builder.add_body(Box((0.3, 0.05, 0.2)), mass=40.0, position=(0, 0.45, 0), collides=False)
+    for x in (-0.25, 0.25):
+        for z in (-0.15, 0.15):
+            foot = builder.add_body(Sphere(0.05), mass=0.3, position=(x, 0.05, z), friction=0.8)
+            builder.add_motor(builder.add_joint(Hinge(top, foot, (x, 0.4, z), (0, 0, 1))), kind="velocity", cap=100.0)
+    model, state = builder.build(undamped(dt=1 / 60, velocity_iterations=40))
+    assert mechanism_layout.takes_contacts(model.scene)
+    actions = jnp.zeros((60, 4), state.position.dtype)
+    final = jax.jit(lambda state: rollout(model, state, actions)[0])(state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), 1e-4)
+    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-4)
+    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
+    gate("borne by the ground / weight - 1", borne / (GRAVITY * (40.0 + 4 * 0.3)) - 1, 1e-4)
