@@ -7,7 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Fixed, Hinge, Plane, SceneBuilder, Sphere, contact_forces, joint_gaps, rollout
+from mathota_jax import (
+    Box,
+    Fixed,
+    Hinge,
+    Plane,
+    SceneBuilder,
+    Sphere,
+    contact_forces,
+    is_asleep,
+    joint_gaps,
+    rollout,
+    step,
+)
 from mathota_jax.constraints import mechanism_layout
 from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, GRAVITY, undamped
@@ -67,6 +79,26 @@ def test_a_leg_stands_on_its_foot(precision, masses, dt, gate):
     gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-5)
     borne = np.asarray(contact_forces(model, final), float)[:, 1].sum()
     gate("borne by the ground / weight - 1", abs(borne) / (GRAVITY * sum(masses)) - 1, 1e-5)
+
+
+def test_a_frictionless_leg_stands(gate):
+    builder = on_ground(0.0)
+    leg(builder, (0.2, 10.0, 10.0), friction=0.0)
+    model, state = builder.build(undamped(dt=1 / 60))
+    assert mechanism_layout.takes_contacts(model.scene) and not model.scene.friction
+    gate("moved [m]", np.asarray(stand(model, state).position - state.position, float), 1e-5)
+
+
+def test_a_leg_sleeps_and_wakes_as_a_whole(gate):
+    builder = on_ground()
+    bodies = leg(builder, (0.2, 10.0, 10.0))
+    model, state = builder.build(undamped(dt=1 / 60, sleep=True))
+    assert mechanism_layout.takes_contacts(model.scene)
+    final = stand(model, state)
+    assert np.asarray(is_asleep(model, final))[bodies].all()
+    gate("moved [m]", np.asarray(final.position - state.position, float), 1e-5)
+    pushed = step(model, dataclasses.replace(final, velocity=final.velocity.at[bodies[-1], 0].set(0.5)))
+    assert not np.asarray(is_asleep(model, pushed))[bodies].any()
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
