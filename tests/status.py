@@ -68,6 +68,11 @@ FEATURES = (
     Feature("fast bodies stopped at the time of impact", "mathota_jax.dynamics:events", "physics/test_fast_bodies.py"),
     Feature("chains and trees of joints solved exactly", "mathota_jax.constraints:mechanism", "physics/test_chain.py"),
     Feature(
+        "robots on feet far lighter than they are",
+        "mathota_jax.constraints:mechanism_contacts",
+        "physics/test_mechanism_contacts.py",
+    ),
+    Feature(
         "closed loops of joints solved exactly", "mathota_jax.constraints:mechanism_loops", "physics/test_loops.py"
     ),
     Feature("steps split at their impacts", "mathota_jax:impact_splitting", "physics/test_impact_events.py"),
