@@ -23,6 +23,7 @@ from mathota_jax import (
 )
 from mathota_jax.collision.pairs import CLOSED_FORM, PAIRS, SEPARATING_AXES
 from mathota_jax.geometry import SHAPES
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.poses import UPRIGHT, at, turned
 
 QUICK_METHODS = (CLOSED_FORM, SEPARATING_AXES)
@@ -129,6 +130,7 @@ def test_box_flat_on_a_box_has_four_contact_points():
                                [(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])  # fmt: skip
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.parametrize(
     ("sizes", "pose_a", "pose_b"),
     [

@@ -25,6 +25,7 @@ from mathota_jax import (
 from mathota_jax.collision.rays import RAYS
 from mathota_jax.geometry import SHAPES
 from tests.hulls import BOX_CORNERS
+from tests.marks import QUICK_AND_SLOW_PRECISION
 
 HOUSE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0.5, 1.6, 0], [0, 1, 0]])
 HOUSE = np.concatenate([HOUSE, HOUSE + np.array([0.2, 0.1, 0.7])])
@@ -228,6 +229,7 @@ def test_no_ray_slips_through_a_seam(precision):
     np.testing.assert_allclose(box.distance, 2.5 * np.sqrt(3), rtol=1e-6)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_axis_parallel_and_degenerate_rays_are_finite(precision):
     directions = np.concatenate([np.eye(3), -np.eye(3), np.zeros((1, 3))])
     starts = np.concatenate([-3 * np.eye(3), 3 * np.eye(3), np.full((1, 3), 3.0)])

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mathota_jax import Flag, Options, advance, apply_force, interpolate, step, substep
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import GRAVITY, box_stack, slab_on_plane, sphere_on_plane, undamped, with_dt
 
 DT = 1 / 64  # a power of two: sums of steps are exact
@@ -156,6 +157,7 @@ def test_interpolation_has_finite_gradients_where_nothing_moved(float64):
     assert all(np.isfinite(part).all() for part in gradient)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.parametrize(
     "scene",
     [
