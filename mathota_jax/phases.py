@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +87,24 @@ def gravity(model: Model) -> Vec3:
     return Vec3(*(model.gravity[axis][None] for axis in range(3)))
 
 
+class SolvedRows(NamedTuple):
+    """Solution of the velocity constraints.
+
+    Attributes:
+      velocity: (component, block, world).
+      impulses: of all groups (turn, row, column, world).
+      failed: 1 for each world (world,) that was not solved; None from "pgs".
+      held: impulses of mechanisms where there is nothing else.
+      uncut: impulses with the full rebounds; None where none is ever cut.
+    """
+
+    velocity: Array
+    impulses: tuple[Array, ...]
+    failed: Array | None = None
+    held: mechanism_links.Impulses | None = None
+    uncut: tuple[Array, ...] | None = None
+
+
 def solve_rows(
     scene: Scene,
     problem: Problem,
@@ -94,36 +113,80 @@ def solve_rows(
     change: Array | None = None,
     known: bool = False,
     held: mechanism_links.Impulses | None = None,
-) -> tuple[Array, tuple[Array, ...], Array | None, mechanism_links.Impulses | None]:
-    """Phase 5: velocity constraints, unless `start` is `known` to solve them; `change` is what it does to the velocity.
+) -> SolvedRows:
+    """Phase 5: velocity constraints.
 
-    Also 1 for each world (world,) that was not solved, None from "pgs"; and what mechanisms alone are `held` with, which
-    may be known.
+    Args:
+      scene: static scene.
+      problem: the constraints.
+      velocity: (component, block, world) without them.
+      start: impulses to start from.
+      change: what these do to the velocity, where that is known.
+      known: whether they solve the constraints, but for rebounds that have to be cut.
+      held: what mechanisms alone are held with, where that is known.
     """
     rows = problem.rows
     worlds = max([velocity.shape[-1], *(group.bias.shape[-1] for group in rows)])
     velocity = jnp.broadcast_to(velocity, (*velocity.shape[:-1], worlds))
-    if problem.held is None:
-        solved, impulses, failed = _sweep(scene, rows, velocity, start, known, change)
-        if scene.rebounds_together and not known:
-            again = functools.partial(_impulses, scene, velocity, start, change)
-            contacts = tuple(problem.contact_rows)
-            solved, impulses = rebound_limit.limit(again, problem.joint_rows, contacts, velocity, solved, impulses)
-        return solved, impulses, failed, None
     if covers(scene):
+        assert problem.held is not None
         nothing = tuple(jnp.zeros_like(impulse) for impulse in start)
         solved, impulses, held = mechanism.hold(problem.held, problem.joint_rows, velocity, nothing, held)
-        return solved, impulses, None, held
-    return *_solve_mechanisms(scene, problem, problem.held, velocity, start), None
+        return SolvedRows(solved, impulses, held=held)
+    if scene.rebounds_may_gain:
+        start = in_every_world(start, worlds)
+    begin = _Begin(velocity, _held(problem, velocity), start, change)
+    solved, impulses, failed = _solve_all(scene, problem, begin, known)
+    if not scene.rebounds_may_gain:
+        return SolvedRows(solved, impulses, failed)
+
+    def with_contacts(contacts: list[contact.ContactRows]) -> tuple[Array, tuple[Array, ...]]:
+        return _solve_all(scene, problem.with_contacts(contacts), begin, known=False)[:2]
+
+    cut = rebound_limit.limit(with_contacts, problem.contact_rows, begin.with_joints, solved, impulses)
+    return SolvedRows(*cut, failed, uncut=impulses)
+
+
+class _Begin(NamedTuple):
+    """What the solvers begin with.
+
+    Attributes:
+      velocity: (component, block, world) without constraints.
+      with_joints: the same where mechanisms hold.
+      impulses: of all groups.
+      change: what these do to the velocity, where that is known.
+    """
+
+    velocity: Array
+    with_joints: Array
+    impulses: tuple[Array, ...]
+    change: Array | None
+
+
+def _held(problem: Problem, velocity: Array) -> Array:
+    """Velocity with which mechanisms hold, and nothing else."""
+    if problem.held is None:
+        return velocity
+    nothing = tuple(jnp.zeros_like(group.bias) for group in problem.joint_rows)
+    return mechanism.hold(problem.held, problem.joint_rows, velocity, nothing)[0]
+
+
+def _solve_all(
+    scene: Scene, problem: Problem, begin: _Begin, known: bool
+) -> tuple[Array, tuple[Array, ...], Array | None]:
+    """`solve_rows` where there are other rows than those of mechanisms."""
+    if problem.held is None:
+        return _sweep(scene, problem.rows, begin.velocity, begin.impulses, known, begin.change)
+    if problem.reduced is not None:
+        return *_solve_reduced(scene, problem, problem.reduced, problem.held, begin), None
+    return _solve_mechanisms(scene, problem, problem.held, begin.velocity, begin.impulses)
 
 
 def _solve_mechanisms(
     scene: Scene, problem: Problem, held: mechanism_links.Links, velocity: Array, start: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
-    """`solve_rows` where there are mechanisms and other rows: what the former hold, holds exactly in the end."""
+    """The same where there are mechanisms: what they hold, holds exactly in the end."""
     rows = problem.rows
-    if problem.reduced is not None:
-        return *_solve_reduced(scene, problem, problem.reduced, held, velocity, start), None
 
     def hold(velocity: Array, impulses: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         return mechanism.hold(held, problem.joint_rows, velocity, impulses)[:2]
@@ -156,24 +219,16 @@ def _solve_reduced(
     problem: Problem,
     reduced: mechanism_contacts.Reduced,
     held: mechanism_links.Links,
-    velocity: Array,
-    start: tuple[Array, ...],
+    begin: _Begin,
 ) -> tuple[Array, tuple[Array, ...]]:
     """The same where contacts, too, act on mechanisms as wholes."""
-    nothing = tuple(jnp.zeros_like(impulse) for impulse in start)
-    free = mechanism.hold(held, problem.joint_rows, velocity, nothing)[0]
-    first = lax.stop_gradient(mechanism_contacts.to_reduced(scene, problem.joint_rows, start))
-    found = _sweep(scene, reduced.rows, reduced.rates(free), first, known=False)[1]
+    first = lax.stop_gradient(mechanism_contacts.to_reduced(scene, problem.joint_rows, begin.impulses))
+    found = _sweep(scene, reduced.rows, reduced.rates(begin.with_joints), first, known=False)[1]
     impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, found)
     # What the joints take for it; the velocity is known better than their large impulses on light links would have it.
-    moved = free + reduced.change(found)
-    return moved, mechanism.hold(held, problem.joint_rows, add_impulses(problem.rows, velocity, impulses), impulses)[1]
-
-
-def _impulses(
-    scene: Scene, velocity: Array, start: tuple[Array, ...], change: Array | None, rows: tuple[Rows, ...]
-) -> tuple[Array, ...]:
-    return _sweep(scene, rows, velocity, start, False, change)[1]
+    moved = begin.with_joints + reduced.change(found)
+    pushed = add_impulses(problem.rows, begin.velocity, impulses)
+    return moved, mechanism.hold(held, problem.joint_rows, pushed, impulses)[1]
 
 
 def _sweep(

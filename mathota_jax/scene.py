@@ -184,10 +184,18 @@ class Scene:
         return self.static_slot_count + sum(group.slot_count for group in self.compact_groups)
 
     @functools.cached_property
-    def rebounds_together(self) -> bool:
-        """Whether anything bounces where more than one pair of bodies can meet at once."""
-        pairs = sum(len(group.bodies_a) for group in self.pair_groups)
-        return self.restitution and (pairs > 1 or bool(self.compact_groups))
+    def rebounds_may_gain(self) -> bool:
+        """Whether anything bounces whose rebound may take more energy than the impact had.
+
+        Not one free ball on something static, or on another: the impulse of its contact changes no other rate of it.
+        """
+        pairs = [pair for group in self.pair_groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
+        if len(pairs) != 1 or self.compact_groups:
+            return self.restitution
+        balls = {shape.body for shape in self.shapes if shape.kind == "sphere"}
+        jointed = {body for joint in self.joints for body in (joint.parent, joint.child)}
+        free_balls = all(self.static[body] or (body in balls and body not in jointed) for body in pairs[0])
+        return self.restitution and not free_balls
 
     @property
     def place_count(self) -> int:

@@ -121,10 +121,12 @@ class Solved(NamedTuple):
     Attributes:
       forces: of all constraints; None where they are not all that the sweeps find.
       mechanisms: solutions, where there are mechanisms.
+      uncut: impulses with the full rebounds, where some may be cut.
     """
 
-    forces: Forces | None
-    mechanisms: Solutions | None
+    forces: Forces | None = None
+    mechanisms: Solutions | None = None
+    uncut: tuple[Array, ...] | None = None
 
 
 def step_worlds_last(model: Model, state: State, action: Array) -> State:
@@ -132,26 +134,22 @@ def step_worlds_last(model: Model, state: State, action: Array) -> State:
     return _solve_step(model, state, action)[0]
 
 
-def _solve_step(
-    model: Model, state: State, action: Array, solved: Solved | None = None
-) -> tuple[State, Solutions | None]:
-    """The same, and the solutions of mechanisms; `jax.vmap(step)` calls this.
+def _solve_step(model: Model, state: State, action: Array, solved: Solved | None = None) -> tuple[State, Solved]:
+    """The same, and what the solvers found beside it; `jax.vmap(step)` calls this.
 
     `solved` is what the solvers found in this very step; None if they have still to find it.
     """
     runs = (model.dt > 0) & (model.dt < jnp.inf)
     # The program must stay finite for the derivative of the selection to be 0.
     passing = dataclasses.replace(model, dt=jnp.where(runs, model.dt, 1.0))
-    new, mechanisms = _simulate_or_rest(passing, state, action, solved)
+    new, found = _simulate_or_rest(passing, state, action, solved)
     new = jax.tree.map(lambda before, after: jnp.where(runs, after, before), state, new)
     bad = jnp.where(runs | (model.dt == 0), 0, int(Flag.INVALID_TIME_STEP))
     bad = bad | jnp.where(values_in_range(model), 0, int(Flag.INVALID_PARAMETER))
-    return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype)), jax.lax.stop_gradient(mechanisms)
+    return dataclasses.replace(new, flags=new.flags | bad.astype(state.flags.dtype)), jax.lax.stop_gradient(found)
 
 
-def _simulate_or_rest(
-    model: Model, state: State, action: Array, solved: Solved | None
-) -> tuple[State, Solutions | None]:
+def _simulate_or_rest(model: Model, state: State, action: Array, solved: Solved | None) -> tuple[State, Solved]:
     """`_simulate`, but for batches in which everything sleeps."""
     if not (model.scene.options.sleep and model.scene.dynamic_bodies):
         return _simulate(model, state, action, solved)
@@ -164,20 +162,18 @@ def _simulate_or_rest(
         state,
         action,
     )
-    return new, None
+    return new, Solved()
 
 
-def _simulate(
-    model: Model, state: State, action: Array, solved_before: Solved | None
-) -> tuple[State, Solutions | None]:
+def _simulate(model: Model, state: State, action: Array, solved_before: Solved | None) -> tuple[State, Solved]:
     """The phases of a step."""
     scene = model.scene
     if scene.options.impact_events and scene.restitution and scene.pair_groups:
-        return split_at_impacts(model, state, action), None
+        return split_at_impacts(model, state, action), Solved()
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:
-        return new_state(scene, state, moving(scene, bodies), {}), None
-    known, mechanisms = solved_before or (None, None)
+        return new_state(scene, state, moving(scene, bodies), {}), Solved()
+    known, mechanisms, uncut = solved_before or Solved()
     held, closed = mechanisms or (None, None)
     blocks = moving(scene, bodies)
     inertia = compute_once(moving_inertia(scene, model, blocks.orientation), state.position)
@@ -186,7 +182,9 @@ def _simulate(
     free, decay = compute_once(free_velocities(model, blocks, acting, halfway, force, torque), state.position)
     problem = constrain(model, state, bodies, blocks, acting, free, halfway, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
-    if known is not None:
+    if uncut is not None:
+        start, change = uncut, None
+    elif known is not None:
         start, change = known_impulses(model, problem, known), None
     else:
         start, change = starting_impulses(model, state, problem, acting, packed)
@@ -195,7 +193,8 @@ def _simulate(
     if small:
         solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
-        solved, impulses, failed, held = solve_rows(scene, problem, packed, start, change, known is not None, held)
+        is_solved = known is not None or uncut is not None
+        solved, impulses, failed, held, uncut = solve_rows(scene, problem, packed, start, change, is_solved, held)
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(
         blocks, inertia, acting, halfway, free, torque, decay, solved, lever, model.dt, beyond, gained
@@ -211,23 +210,23 @@ def _simulate(
     if last is not None and state.end_forces is not None:
         new = dataclasses.replace(new, end_forces=end_forces(model, problem, state.end_forces, last))
     new = let_sleep(model, state, new, action, problem) if scene.options.sleep else new
-    return new, None if closed is None else Solutions(held, closed)
+    return new, Solved(None, None if closed is None else Solutions(held, closed), uncut)
 
 
-def _reusable(result: tuple[State, Solutions | None], model: Model, state: State, action: Array) -> Solved | None:
+def _reusable(result: tuple[State, Solved], model: Model, state: State, action: Array) -> Solved | None:
     """What the solvers of a step found, as far as derivatives can do without finding it again."""
     del state, action
-    new, mechanisms = result
-    if mechanisms is not None:
-        return Solved(None, mechanisms)
+    new, found = result
+    if found.mechanisms is not None:
+        return found._replace(uncut=None)
     options = model.scene.options
     # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts.
     if options.sleep or options.impact_events or options.solver == "soft_step":
         return None
-    return Solved(Forces(new.joint_force, new.contact_force), None)
+    return found if found.uncut is not None else Solved(Forces(new.joint_force, new.contact_force))
 
 
-def _step_again(solved: Solved | None, model: Model, state: State, action: Array) -> tuple[State, Solutions | None]:
+def _step_again(solved: Solved | None, model: Model, state: State, action: Array) -> tuple[State, Solved]:
     return _solve_step(model, state, action, solved)
 
 

@@ -38,6 +38,7 @@ from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.spread import add_all_slices
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
 
 ROUNDS = 16
@@ -279,9 +280,9 @@ def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, f
     lost, slope, bend = zero, zero, zero
     for group, first, more in zip(rows, stopping, difference, strict=True):
         before, middle, after = (row_velocity(group, v) for v in (velocity, stopped, at_end))
-        lost = lost - 0.5 * (first * (before + middle)).sum((0, 1, 2))
-        slope = slope + (more * middle).sum((0, 1, 2))
-        bend = bend + (more * (after - middle)).sum((0, 1, 2))
+        lost = lost - add_all_slices(0.5 * first * (before + middle))
+        slope = slope + add_all_slices(more * middle)
+        bend = bend + add_all_slices(more * (after - middle))
     gains = settle(jnp.where(slope + 0.5 * bend > lost, 1.0, 0.0)) > 0.5
     share = share_without_gain(gains, lost, slope, bend)
     return tuple(first + share * more for first, more in zip(stopping, difference, strict=True))

@@ -206,7 +206,7 @@ def contact_rows(
     if scene.restitution and scene.options.solver != "soft_step":
         asked, lasting = loaded(approach, target, lever, model.dt)
         load = Load(*(pack_scalars(table, [part], worlds) for part in (asked, lasting)))
-    if scene.rebounds_together:
+    if scene.rebounds_may_gain:
         side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
         falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
     return ContactRows(

@@ -46,6 +46,7 @@ from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_all_slices
 from mathota_jax.spatial.vector import dot
 
 ROUNDS = 1
@@ -212,8 +213,10 @@ def closing_shift(links: Links, errors: Impulses) -> Array:
     for members in links.layout.floating_trees:
         of_tree = column(np.isin(np.arange(len(links.layout.links)), members))
         weight = jnp.where(of_tree, mass, 0.0)
-        weight = weight / weight.sum(0)
-        shift = shift.map(lambda x, weight=weight, of_tree=of_tree: x - jnp.where(of_tree, (weight * x).sum(0), 0.0))
+        weight = weight / add_all_slices(weight)
+        shift = shift.map(
+            lambda x, weight=weight, of_tree=of_tree: x - jnp.where(of_tree, add_all_slices(weight * x), 0.0)
+        )
     return to_blocks(links.layout, pack_blocks(shift, shift * 0.0))
 
 

@@ -9,6 +9,7 @@ rows: the Jacobian of a row picks its own rate, its response is its column of th
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -63,6 +64,15 @@ class Reduced(NamedTuple):
     def rates(self, velocity: Array) -> Array:
         """Rates (row, 1, world) of the velocities (component, block, world)."""
         return _rates(self.sides, velocity[:, :, None])
+
+    def with_biases(self, contacts: Sequence[Rows]) -> Reduced:
+        """The same with those of `contacts`."""
+        count = len(self.rows) - len(contacts)
+        groups = (
+            dataclasses.replace(mine, bias=_by_constraint(group.table, group.bias))
+            for mine, group in zip(self.rows[count:], contacts, strict=True)
+        )
+        return self._replace(rows=(*self.rows[:count], *groups))
 
     def change(self, impulses: Sequence[Array]) -> Array:
         """What impulses of the reduced groups change, with the joints held; (component, block, world)."""

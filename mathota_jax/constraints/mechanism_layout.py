@@ -127,9 +127,7 @@ def layout(scene: Scene) -> Layout | None:
     if options.impact_events or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
-    # Rebounds that gain energy are cut only where no joints are solved as trees.
-    with_contacts = found is not None and not scene.rebounds_together and _takes_contacts(scene, found)
-    if found is not None and (with_contacts or _has_no_others(scene, found)):
+    if found is not None and (_takes_contacts(scene, found) or _has_no_others(scene, found)):
         return found
     return None if options.solver == "soft_step" else _of_trees(scene, LEAST_JOINTS)
 

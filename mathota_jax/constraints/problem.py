@@ -20,6 +20,7 @@ from mathota_jax.constraints import (
     mechanism_layout,
     mechanism_links,
     mechanism_rows,
+    rebound_limit,
     row_coefficients,
     substep_rows,
     warm_start,
@@ -70,6 +71,11 @@ class Problem(NamedTuple):
     @property
     def rows(self) -> tuple[Rows, ...]:
         return (*self.joint_rows, *(group.rows for group in self.contact_rows))
+
+    def with_contacts(self, contact_rows: list[contact.ContactRows]) -> Problem:
+        """The same with these, which differ in their biases alone."""
+        reduced = None if self.reduced is None else self.reduced.with_biases([group.rows for group in contact_rows])
+        return self._replace(contact_rows=contact_rows, reduced=reduced)
 
 
 def constrain(
@@ -141,6 +147,8 @@ def constrain(
             close = compact.close_pairs(model, bodies, free)
             sets, more = compact.contacts_and_rows(model, bodies, close, motion)
             found, contact_rows = found + sets, contact_rows + more
+        if held is not None and scene.rebounds_may_gain:
+            contact_rows = rebound_limit.with_held_falling(held, contact_rows, gravity)
         contacts = join_contacts(found)
         offsets = contact_offsets(model, bodies, contacts, close)
     if small_steps:

@@ -9,17 +9,20 @@ the full ones the work is a parabola: a world that gains gets the share at which
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.constraints import mechanism, mechanism_links
 from mathota_jax.constraints.contact import ContactRows
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
+from mathota_jax.constraints.mechanism_links import Links
+from mathota_jax.solver.rows import Rows, row_velocity
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import settle
 from mathota_jax.spatial.spread import add_all_slices
+from mathota_jax.spatial.vector import Vec3
 
 Impulses = tuple[Array, ...]
 
@@ -28,34 +31,29 @@ ROUND_OFF = 64
 
 
 def limit(
-    solve: Callable[[tuple[Rows, ...]], Impulses],
-    joints: tuple[Rows, ...],
-    contacts: tuple[ContactRows, ...],
+    solve: Callable[[list[ContactRows]], tuple[Array, Impulses]],
+    contacts: Sequence[ContactRows],
     velocity: Array,
     solved: Array,
     impulses: Impulses,
 ) -> tuple[Array, Impulses]:
     """Velocity and impulses, with less rebound in the worlds that bounce and whose contacts do work.
 
-    Not differentiated: the derivatives are those of the full rebound.
+    Differentiable: the share, too, depends on the impact.
 
     Args:
-      solve: impulses of rows.
-      joints, contacts: all rows of the step.
-      velocity: (component, block, world) without them.
-      solved, impulses: velocity, and impulses of all groups, with the full rebound.
+      solve: velocity, and impulses of all groups, with some contacts.
+      contacts: all contacts of the step.
+      velocity: (component, block, world) without them, with which joints that are solved as trees hold.
+      solved, impulses: velocity, and impulses of all groups, those of the contacts last, with the full rebound.
     """
-    full = solved, impulses
-    joints, contacts, velocity, solved, impulses = lax.stop_gradient((joints, contacts, velocity, solved, impulses))
-    rows = (*joints, *(contact.rows for contact in contacts))
-    gains = _gains(contacts, 0.5 * (velocity + solved), impulses[len(joints) :])
+    joint_count = len(impulses) - len(contacts)
+    gains = _gains(contacts, 0.5 * (velocity + solved), impulses[joint_count:])
 
     def share_out(solved: Array, impulses: Impulses) -> tuple[Array, Impulses]:
-        inelastic = tuple(dataclasses.replace(contact.rows, bias=_without(contact.rows.bias)) for contact in contacts)
-        stopping = solve((*joints, *inelastic))
-        stopped = add_impulses(rows, velocity, stopping)
+        stopped, stopping = solve([contact._replace(rows=_without_rebound(contact.rows)) for contact in contacts])
         more = tuple(last - first for first, last in zip(stopping, impulses, strict=True))
-        share = _share(gains, contacts, velocity, stopped, solved, stopping[len(joints) :], more[len(joints) :])
+        share = _share(gains, contacts, velocity, stopped, solved, stopping[joint_count:], more[joint_count:])
         return jax.tree.map(
             lambda first, more, full: jnp.where(gains, first + share * more, full),
             (stopped, stopping),
@@ -63,11 +61,21 @@ def limit(
             (solved, impulses),
         )
 
-    limited = lax.cond(gains.any(), share_out, lambda *unchanged: unchanged, solved, impulses)
-    return jax.tree.map(lambda full, less: full + (less - lax.stop_gradient(full)), full, limited)
+    # Nothing of it is stored for reverse mode, where it is rare as elsewhere.
+    share_out = jax.checkpoint(share_out, prevent_cse=False)
+    return lax.cond(gains.any(), share_out, lambda *unchanged: unchanged, solved, impulses)
 
 
-def _gains(contacts: tuple[ContactRows, ...], middle: Array, impulses: Impulses) -> Array:
+def with_held_falling(links: Links, contacts: Sequence[ContactRows], gravity: Vec3) -> list[ContactRows]:
+    """Contacts with what gravity (1, world) does where joints are solved as trees, which bear part of it."""
+    falling = jnp.stack([*gravity, *(3 * [jnp.zeros_like(gravity.x)])])
+    falling = jnp.broadcast_to(falling, (len(falling), links.layout.block_count, falling.shape[-1]))
+    bearing = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism_links.rates(links, falling)))
+    held = falling + mechanism_links.push(links, bearing)
+    return [contact._replace(falling=row_velocity(contact.rows, held) * contact.lever) for contact in contacts]
+
+
+def _gains(contacts: Sequence[ContactRows], middle: Array, impulses: Impulses) -> Array:
     """Worlds (world,) where something bounces and all contacts together do work, at the mean velocity `middle`."""
     work, turnover, rebounds = jnp.zeros(()), jnp.zeros(()), jnp.zeros(())
     for contact, impulse in zip(contacts, impulses, strict=True):
@@ -82,7 +90,7 @@ def _gains(contacts: tuple[ContactRows, ...], middle: Array, impulses: Impulses)
 
 def _share(
     gains: Array,
-    contacts: tuple[ContactRows, ...],
+    contacts: Sequence[ContactRows],
     velocity: Array,
     stopped: Array,
     solved: Array,
@@ -126,6 +134,8 @@ def _rate(contact: ContactRows, middle: Array) -> Array:
     return row_velocity(contact.rows, middle) - contact.falling
 
 
-def _without(bias: Array) -> Array:
-    """Biases without rebound, which alone is negative."""
-    return jnp.concatenate([jnp.maximum(bias[:, :1], 0.0), bias[:, 1:]], axis=1)
+def _without_rebound(rows: Rows) -> Rows:
+    """Rows without the rebound, which alone has a negative bias."""
+    return dataclasses.replace(
+        rows, bias=jnp.concatenate([jnp.maximum(rows.bias[:, :1], 0.0), rows.bias[:, 1:]], axis=1)
+    )
