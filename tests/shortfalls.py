@@ -24,9 +24,6 @@ SHORTFALLS: dict[str, str] = {
         f"10 s, and without bound in steps of 100 s ({gain}); none in steps up to 1 s, gate 1 %"
         for precision, gain in (("float32", "factor 1e11 or not finite"), ("float64", "factor 2e4"))
     },
-    "tests/physics/test_fast_bodies.py::test_a_spinning_plank_gains_no_energy[0.0-0.5]": "planks that turn by a radian and "
-    "more in a step and bounce without friction: 8 of 96 gain more than 1 %, one thrice its energy, gate 0.1 %; none with "
-    "friction or without restitution, 2 (21 %) where they do not stop at the wall",
     "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
     "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "
     "stay so, gate 5 mm; 1 mm with the default solver",
