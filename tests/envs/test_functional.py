@@ -11,7 +11,6 @@ import pytest
 import mathota_envs
 from mathota_envs import ENVIRONMENTS, EnvState, make
 from mathota_envs.worlds import start_world, start_worlds, step_world, step_worlds
-from tests.marks import slow_but
 
 EVERY_ID = pytest.mark.parametrize("id", ENVIRONMENTS)
 
@@ -95,7 +94,8 @@ def _value_and_derivatives(environment, action, options, weights):
     return jax.value_and_grad(value, argnums=(0, 1))(action, options)
 
 
-@pytest.mark.parametrize("id", slow_but(("mathota/InvertedPendulum-v0",), ENVIRONMENTS))
+@pytest.mark.slow
+@EVERY_ID
 def test_reverse_derivatives_through_reset_and_step_equal_central_differences(id, float64):
     environment = make(id)
     generator = np.random.default_rng(0)

@@ -137,7 +137,8 @@ def test_a_sled_slides_as_one_body(precision, gate):
     gate("joint gaps [m]", np.asarray(joint_gaps(model, final).translation, float), 1e-6)
 
 
-@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 def test_derivatives_of_a_sled(float64, gate, mode):
     """By the speed, the coefficients of friction and gravity."""
     model, state, bodies, time, steps = slide()
