@@ -138,11 +138,9 @@ def test_worlds_do_not_touch_each_other(float64, gate):
     states = [
         dataclasses.replace(state, velocity=state.velocity.at[3].set(jnp.array([0.3 * k, -k, 0.1]))) for k in range(3)
     ]
-    advance = jax.jit(jax.vmap(step, (None, 0)))
-    together = advance(model, stack(states))
+    together = jax.vmap(step, (None, 0))(model, stack(states))
     for world, alone in enumerate(states):
-        # Three of one kind take as many as one does, and the same program.
-        gate("velocity [m/s]", together.velocity[world] - advance(model, stack([alone] * 3)).velocity, 1e-8)
+        gate("velocity [m/s]", together.velocity[world] - step(model, alone).velocity, 1e-8)
 
 
 def forget_traces():
@@ -169,14 +167,20 @@ def moved(model, state, push, friction):
     return step(model, dataclasses.replace(state, applied_force=state.applied_force.at[1].set(push))).velocity[1]
 
 
-@pytest.mark.parametrize("push", [(1.0, 0.5, 0.3), (6.0, 0.5, 2.0)])
-@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
-def test_derivatives_against_finite_differences(float64, push, mode, gate):
-    """Sticking and sliding: the velocity is differentiable, though the impulses are not unique."""
-    model, state = slab_on_plane(friction=0.4, options=undamped(dt=1 / 60, solver="converged"))
+STICKING_AND_SLIDING = pytest.mark.parametrize("push", [(1.0, 0.5, 0.3), (6.0, 0.5, 2.0)])
+
+
+def slab():
+    return slab_on_plane(friction=0.4, options=undamped(dt=1 / 60, solver="converged"))
+
+
+@STICKING_AND_SLIDING
+def test_derivatives_against_finite_differences(float64, push, gate):
+    """Reverse mode of the velocity, whose impulses are not unique."""
+    model, state = slab()
     push = jnp.asarray(push)
     run = jax.jit(moved)
-    by_push, by_friction = mode(moved, (2, 3))(model, state, push, 0.4)
+    by_push, by_friction = jax.jacrev(moved, (2, 3))(model, state, push, 0.4)
     h = 1e-4
     for axis in range(3):
         change = h * jnp.eye(3)[axis]
@@ -185,6 +189,15 @@ def test_derivatives_against_finite_differences(float64, push, mode, gate):
     truth = (run(model, state, push, 0.4 + h) - run(model, state, push, 0.4 - h)) / (2 * h)
     gate("dv/dmu", by_friction - truth, 1e-6)
     assert (np.abs(truth).max() > 1e-2) == (float(push[0]) > 3)
+
+
+@pytest.mark.slow
+@STICKING_AND_SLIDING
+def test_both_modes_agree(float64, push, gate):
+    arguments = (*slab(), jnp.asarray(push), 0.4)
+    forward, reverse = (mode(moved, (2, 3))(*arguments) for mode in (jax.jacfwd, jax.jacrev))
+    for by, first, second in zip(("push", "friction"), forward, reverse, strict=True):
+        gate(f"by {by}, forward - reverse", first - second, 1e-9)
 
 
 @pytest.mark.parametrize("friction", [None, 0.5])
