@@ -135,7 +135,7 @@ def solve_rows(
         return SolvedRows(solved, impulses, held=held)
     if scene.rebounds_may_gain:
         start = in_every_world(start, worlds)
-    begin = _Begin(velocity, _held(problem, velocity), start, change)
+    begin = _Begin(velocity, _held(scene, problem, velocity, start), start, change)
     solved, impulses, failed = _solve_all(scene, problem, begin, known)
     if not scene.rebounds_may_gain:
         return SolvedRows(solved, impulses, failed)
@@ -152,7 +152,7 @@ class _Begin(NamedTuple):
 
     Attributes:
       velocity: (component, block, world) without constraints.
-      with_joints: the same where mechanisms hold.
+      with_joints: the same where mechanisms hold, if anything asks for it.
       impulses: of all groups.
       change: what these do to the velocity, where that is known.
     """
@@ -163,12 +163,11 @@ class _Begin(NamedTuple):
     change: Array | None
 
 
-def _held(problem: Problem, velocity: Array) -> Array:
-    """Velocity with which mechanisms hold, and nothing else."""
-    if problem.held is None:
+def _held(scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...]) -> Array:
+    """Velocity with which mechanisms hold, and nothing else, where contacts act on them as wholes or their work counts."""
+    if problem.held is None or (problem.reduced is None and not scene.rebounds_may_gain):
         return velocity
-    nothing = tuple(jnp.zeros_like(group.bias) for group in problem.joint_rows)
-    return mechanism.hold(problem.held, problem.joint_rows, velocity, nothing)[0]
+    return mechanism.hold(problem.held, problem.joint_rows, velocity, start)[0]
 
 
 def _solve_all(

@@ -189,13 +189,15 @@ class Scene:
 
         Not one free ball on something static, or on another: the impulse of its contact changes no other rate of it.
         """
-        pairs = [pair for group in self.pair_groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
-        if len(pairs) != 1 or self.compact_groups:
-            return self.restitution
-        balls = {shape.body for shape in self.shapes if shape.kind == "sphere"}
+        several = bool(self.compact_groups) or sum(len(group.bodies_a) for group in self.pair_groups) > 1
         jointed = {body for joint in self.joints for body in (joint.parent, joint.child)}
-        free_balls = all(self.static[body] or (body in balls and body not in jointed) for body in pairs[0])
-        return self.restitution and not free_balls
+        free_balls = all(
+            self.static[body] or (kind == "sphere" and body not in jointed)
+            for group in self.pair_groups
+            for bodies, kind in ((group.bodies_a, group.kind_a), (group.bodies_b, group.kind_b))
+            for body in bodies
+        )
+        return self.restitution and (several or not free_balls)
 
     @property
     def place_count(self) -> int:

@@ -33,7 +33,14 @@ from mathota_jax.model import Model
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
 from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.solver.rows import Rows, add_impulses, first_row_velocity, matrix_velocity, row_velocity
+from mathota_jax.solver.rows import (
+    Rows,
+    add_impulses,
+    first_row_velocity,
+    matrix_velocity,
+    row_velocity,
+    with_first_bias,
+)
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
@@ -138,9 +145,8 @@ def corrected(group: ContactRows, found: Foreseen, split: Array) -> tuple[Contac
     """Rows of the contacts that count in this part of a step, and which do not; `split` (world,) if an impact ends it."""
     dropped = (found.apart & split) | found.clear
     returns = found.returns & ~split
-    bias = group.rows.bias
-    first = jnp.where(returns, -found.target, bias[:, :1])
-    rows = dataclasses.replace(group.rows, bias=jnp.concatenate([first, bias[:, 1:]], axis=1))
+    first = jnp.where(returns, -found.target, group.rows.bias[:, :1])
+    rows = with_first_bias(group.rows, first)
     lever = jnp.where(returns, found.lever, group.lever)
     falling = group.falling
     if falling is not None:

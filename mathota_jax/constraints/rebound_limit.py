@@ -8,17 +8,17 @@ the full ones the work is a parabola: a world that gains gets the share at which
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.bodies import pack_blocks
 from mathota_jax.constraints import mechanism, mechanism_links
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.mechanism_links import Links
-from mathota_jax.solver.rows import Rows, row_velocity
+from mathota_jax.solver.rows import Rows, row_velocity, with_first_bias
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import settle
 from mathota_jax.spatial.spread import add_all_slices
@@ -68,7 +68,7 @@ def limit(
 
 def with_held_falling(links: Links, contacts: Sequence[ContactRows], gravity: Vec3) -> list[ContactRows]:
     """Contacts with what gravity (1, world) does where joints are solved as trees, which bear part of it."""
-    falling = jnp.stack([*gravity, *(3 * [jnp.zeros_like(gravity.x)])])
+    falling = pack_blocks(gravity, gravity.map(jnp.zeros_like))
     falling = jnp.broadcast_to(falling, (len(falling), links.layout.block_count, falling.shape[-1]))
     bearing = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism_links.rates(links, falling)))
     held = falling + mechanism_links.push(links, bearing)
@@ -136,6 +136,4 @@ def _rate(contact: ContactRows, middle: Array) -> Array:
 
 def _without_rebound(rows: Rows) -> Rows:
     """Rows without the rebound, which alone has a negative bias."""
-    return dataclasses.replace(
-        rows, bias=jnp.concatenate([jnp.maximum(rows.bias[:, :1], 0.0), rows.bias[:, 1:]], axis=1)
-    )
+    return with_first_bias(rows, jnp.maximum(rows.bias[:, :1], 0.0))

@@ -153,6 +153,11 @@ def first_row_velocity(group: Rows, velocity: Array) -> Array:
     return matrix_velocity(group.table, group.matrix.first_row(), group.places, velocity)
 
 
+def with_first_bias(group: Rows, first: Array) -> Rows:
+    """The rows with the bias `first` (turn, 1, column, world) for the first row of each constraint."""
+    return dataclasses.replace(group, bias=jnp.concatenate([first, group.bias[:, 1:]], axis=1))
+
+
 def map_turns(function: Callable[[Rows, Any], Any], group: Rows, tree: Any) -> Any:
     """`function` of the rows of turns and of arrays (turn, ...), whose results have that axis too.
 

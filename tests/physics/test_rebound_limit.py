@@ -152,15 +152,13 @@ def test_a_cube_strikes_the_ground_with_a_corner(float64, gate):
     builder.add_body(Box(3 * (half,)), mass=1.0, position=(0, 1, 0), friction=friction, restitution=0.9)
     model, state = builder.build(undamped(dt=1e-5, velocity_iterations=2000))
 
-    def with_cube(values, new):
-        return jnp.broadcast_to(values, (count, *values.shape)).at[:, 1].set(new)
-
+    states = repeat(state, count)
     begin = dataclasses.replace(
-        repeat(state, count),
-        position=with_cube(state.position, np.stack([0 * arms[:, 1], -arms[:, 1] - 1e-9, 0 * arms[:, 1]], axis=1)),
-        orientation=with_cube(state.orientation, turns),
-        velocity=with_cube(state.velocity, velocity),
-        angular_velocity=with_cube(state.angular_velocity, spin),
+        states,
+        position=states.position.at[:, 1, 1].set(-arms[:, 1] - 1e-9),
+        orientation=states.orientation.at[:, 1].set(turns),
+        velocity=states.velocity.at[:, 1].set(velocity),
+        angular_velocity=states.angular_velocity.at[:, 1].set(spin),
     )
     end = advance_worlds(repeat(model, count), begin, 1)
 
