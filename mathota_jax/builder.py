@@ -15,12 +15,13 @@ from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.plan import plan_broadphase
 from mathota_jax.constraints.joint_layout import joint_row_count
 from mathota_jax.constraints.warm_start import matches_by_distance
-from mathota_jax.declarations import UNTURNED, Body, boolean, look_up, mass_properties, number
+from mathota_jax.declarations import UNTURNED, Body, boolean, look_up, look_up_all, mass_properties, number
 from mathota_jax.geometry import SHAPES, Compound, Shape
 from mathota_jax.geometry.validation import finite_vector, unit_quaternion
 from mathota_jax.joint_declarations import Joint, Motor, declare_joint, declare_motor, kind_of
 from mathota_jax.model import Model
 from mathota_jax.options import Options
+from mathota_jax.pair_filter import Filter, Ignored, make_filter
 from mathota_jax.rotation import rotate
 from mathota_jax.scene import JointEntry, MotorEntry, PairGroup, Scene, ShapeEntry
 from mathota_jax.shape_table import ShapeTable, heightfield_window, shape_table
@@ -43,6 +44,7 @@ class SceneBuilder:
         self._bodies: list[Body] = []
         self._joints: list[Joint] = []
         self._motors: list[Motor] = []
+        self._ignored: list[Ignored] = []
 
     def add_body(
         self,
@@ -74,7 +76,7 @@ class SceneBuilder:
           restitution: Newton coefficient in [0, 1]; a pair uses the smaller of its two.
           friction: Coulomb coefficient, at least 0; a pair uses the geometric mean of its two.
           static: the body never moves. Planes and heightfields are static always and must say so.
-          collides: False leaves the body out of every contact.
+          collides: False leaves the body out of every contact; `ignore_collisions` out of those with some bodies.
           name: unique name; "body0", "body1", ... by default.
 
         Returns:
@@ -174,6 +176,23 @@ class SceneBuilder:
         self._motors.append(declare_motor(f"motor on joint '{declared.name}'", declared, index, kind, given))
         return len(self._motors) - 1
 
+    def ignore_collisions(self, bodies: Any, others: Any = None) -> None:
+        """Declares that bodies pass through each other, such as the links of a robot.
+
+        What ignores each other costs nothing: such pairs are absent from the program, or never listed by the broadphase.
+        Bodies that a joint connects ignore each other anyway.
+
+        Args:
+          bodies: handle or name of a body, or a sequence of them.
+          others: the same; no body of `bodies` collides with any of these. None: no two of `bodies` collide.
+        """
+        names = [body.name for body in self._bodies]
+        first = frozenset(look_up_all("ignore_collisions: bodies", bodies, names, "body"))
+        second = first if others is None else frozenset(look_up_all("ignore_collisions: others", others, names, "body"))
+        if len(first | second) < 2:
+            raise ValueError(f"ignore_collisions: at least two bodies are needed, got {bodies!r} and {others!r}")
+        self._ignored.append((first, second))
+
     def body(self, body: int | str, label: str = "body") -> int:
         """Handle of a body given by handle or name."""
         return look_up(label, body, [entry.name for entry in self._bodies], "body")
@@ -200,19 +219,21 @@ class SceneBuilder:
     def _scene(self, table: ShapeTable, options: Options) -> Scene:
         bodies = self._bodies
         joined = {(min(joint.parent, joint.child), max(joint.parent, joint.child)) for joint in self._joints}
+        ignored = make_filter(len(bodies), self._ignored)
         broadphase = plan_broadphase(
             table.entries,
             [body.static for body in bodies],
             [body.collides for body in bodies],
             [body.shape.bounding_radius() for body in bodies],
             sorted(joined),
+            ignored,
             options,
         )
         if broadphase and options.continuous:
             raise ValueError(
                 'build: Options.continuous follows pairs that have contact slots of their own; pass broadphase="none"'
             )
-        groups = self._pair_groups(table, frozenset(broadphase.shapes) if broadphase else frozenset())
+        groups = self._pair_groups(table, frozenset(broadphase.shapes) if broadphase else frozenset(), ignored)
         pairs = [pair for group in groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
         if broadphase:
             # Any two that take part may meet: it is enough that one moving body and another one have the property.
@@ -307,8 +328,8 @@ class SceneBuilder:
             else None,
         )
 
-    def _pair_groups(self, table: ShapeTable, planned: frozenset[int]) -> tuple[PairGroup, ...]:
-        """Admissible pairs: not both static, not joined by a joint, both colliding, not both `planned` (broadphase)."""
+    def _pair_groups(self, table: ShapeTable, planned: frozenset[int], ignored: Filter) -> tuple[PairGroup, ...]:
+        """Admissible pairs: not both static, not joined, not ignored, both colliding, not both `planned` (broadphase)."""
         joined = {frozenset((joint.parent, joint.child)) for joint in self._joints}
         order = list(SHAPES)
         members: dict[tuple[str, str], list[tuple[ShapeEntry, ShapeEntry]]] = {}
@@ -323,11 +344,14 @@ class SceneBuilder:
                 continue
             if first.body == second.body or frozenset((first.body, second.body)) in joined:
                 continue
+            if ignored.ignores(first.body, second.body):
+                continue
             a, b = sorted((first, second), key=lambda entry: order.index(entry.kind))
             if (a.kind, b.kind) not in PAIRS:
                 raise ValueError(
                     f"build: bodies '{self._bodies[a.body].name}' ({a.kind}) and '{self._bodies[b.body].name}' "
-                    f"({b.kind}) can not collide with each other; pass collides=False for one of them"
+                    f"({b.kind}) can not collide with each other; pass collides=False for one of them, or name both in "
+                    "ignore_collisions"
                 )
             members.setdefault((a.kind, b.kind), []).append((a, b))
         return tuple(

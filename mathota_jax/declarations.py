@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -84,3 +85,10 @@ def look_up(label: str, handle: Any, names: list[str], noun: str) -> int:
     if not isinstance(handle, int | np.integer) or isinstance(handle, bool) or not 0 <= handle < len(names):
         raise ValueError(f"{label}: no {noun} has the handle {handle!r}; known: {known}")
     return int(handle)
+
+
+def look_up_all(label: str, handles: Any, names: list[str], noun: str) -> list[int]:
+    """Indices of what one handle or name, or a sequence of them, stands for."""
+    if isinstance(handles, str) or not isinstance(handles, Iterable):
+        handles = [handles]
+    return [look_up(label, handle, names, noun) for handle in handles]

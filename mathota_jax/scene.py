@@ -7,6 +7,7 @@ import functools
 from typing import NamedTuple
 
 from mathota_jax.options import Options
+from mathota_jax.pair_filter import Filter
 
 
 class ShapeEntry(NamedTuple):
@@ -79,6 +80,7 @@ class Broadphase(NamedTuple):
       capacity: pairs that can be close at the same time.
       groups: where their contacts go.
       one_by_one: whether every pair has a turn of its own, or pairs without a common body share one.
+      filter: which bodies ignore each other.
     """
 
     method: str
@@ -87,6 +89,7 @@ class Broadphase(NamedTuple):
     capacity: int
     groups: tuple[CompactGroup, ...]
     one_by_one: bool
+    filter: Filter
 
 
 class JointEntry(NamedTuple):

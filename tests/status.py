@@ -99,6 +99,7 @@ FEATURES = (
         "distance, manifold, time of impact of any two shapes", "mathota_jax:time_of_impact", "unit/test_queries.py"
     ),
     Feature("broadphase for scenes of many bodies", "mathota_jax.collision:broadphase", "unit/test_broadphase.py"),
+    Feature("bodies that ignore each other", "mathota_jax:pair_filter", "unit/test_ignored_collisions.py"),
     Feature("raycast against every shape", "mathota_jax:raycast", "unit/test_raycast.py"),
     Feature("meshes (OBJ, STL), convex decomposition", "mathota_jax.io:meshes", "unit/test_meshes.py"),
     Feature("MJCF and URDF", "mathota_jax.io:mjcf", "unit/test_mjcf.py"),

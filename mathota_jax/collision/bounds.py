@@ -26,9 +26,10 @@ Shapes = dict[str, dict[str, Array]]
 
 def admissible_pairs(scene: Scene) -> Admissible:
     """Which pairs of the shapes that take part in the broadphase may collide."""
-    assert scene.broadphase is not None
-    bodies = tuple(scene.shapes[entry].body for entry in scene.broadphase.shapes)
-    return Admissible(bodies, tuple(scene.static[body] for body in bodies), scene.broadphase.excluded)
+    plan = scene.broadphase
+    assert plan is not None
+    bodies = tuple(scene.shapes[entry].body for entry in plan.shapes)
+    return Admissible(bodies, tuple(scene.static[body] for body in bodies), plan.excluded, plan.filter)
 
 
 def kind_ranges(scene: Scene) -> Iterator[tuple[str, range]]:

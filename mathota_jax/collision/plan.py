@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import collections
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from mathota_jax.collision.broadphase.choice import choose_method
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.geometry import SHAPES
 from mathota_jax.options import Options
+from mathota_jax.pair_filter import Filter
 from mathota_jax.scene import Broadphase, CompactGroup, ShapeEntry, Tier
 
 OWN_SLOTS_UP_TO = 20
@@ -38,12 +41,21 @@ FULL_TURNS = 12
 """Turns of a sweep that hold as many pairs as can be without sharing a body; the later ones are narrower."""
 
 
+class _Cell(NamedTuple):
+    """What shapes must have in common for the same pairs to be possible."""
+
+    kind: str
+    static: bool
+    filter_class: int
+
+
 def plan_broadphase(
     entries: Sequence[ShapeEntry],
     static: Sequence[bool],
     collides: Sequence[bool],
     reach: Sequence[float],
     excluded: Sequence[tuple[int, int]],
+    ignored: Filter,
     options: Options,
 ) -> Broadphase | None:
     """The broadphase of a scene, or None if each pair has its own slots.
@@ -51,7 +63,8 @@ def plan_broadphase(
     Args:
       entries: all shapes.
       static, collides, reach: of each body: whether it never moves, whether it has contacts, its bounding radius [m].
-      excluded: pairs of bodies that never collide.
+      excluded: pairs of bodies that a joint connects, which never collide; they count as possible all the same.
+      ignored: which others never collide.
       options: `broadphase` and `pair_capacity`.
 
     Raises:
@@ -62,7 +75,15 @@ def plan_broadphase(
     shapes = sorted(taking_part, key=lambda k: (order.index(entries[k].kind), k))
     moving = sum(not static[entries[k].body] for k in shapes)
     fixed = len(shapes) - moving
-    pair_count = moving * (moving - 1) // 2 + moving * fixed
+
+    def cells(members: Sequence[int]) -> Mapping[_Cell, int]:
+        classes = ignored.classes or (0,) * len(static)
+        bodies = [entries[k].body for k in members]
+        keys = (_Cell(entries[k].kind, static[b], classes[b]) for k, b in zip(members, bodies, strict=True))
+        return collections.Counter(keys)
+
+    among = cells(shapes)
+    pair_count = sum(pairs for *_, pairs in _possible(among, ignored))
     # A search along the motion needs pairs that have slots of their own.
     in_motion = options.continuous or options.impact_events
     own_up_to = ONE_BY_ONE_UP_TO if in_motion else OWN_SLOTS_UP_TO
@@ -72,17 +93,25 @@ def plan_broadphase(
     sizes = [reach[entries[k].body] for k in shapes]
     method = choose_method(moving, fixed, sizes) if options.broadphase == "auto" else options.broadphase
     planes = [k for k, entry in enumerate(entries) if collides[entry.body] and entry.kind == "plane"]
-    points = [PAIRS["plane", entries[k].kind].point_count for k in shapes if not static[entries[k].body]]
-    many = len(planes) * sum(points) > OWN_PLANE_POINTS * moving
-    with_planes = pair_count + moving * len(planes)
+    together = cells(planes + shapes)
+    on_planes = [
+        (PAIRS[a.kind, b.kind].point_count, n) for a, b, n in _possible(together, ignored) if a.kind == "plane"
+    ]
+    many = sum(points * pairs for points, pairs in on_planes) > OWN_PLANE_POINTS * moving
+    with_planes = pair_count + sum(pairs for _, pairs in on_planes)
     if many and not in_motion and _capacity(with_planes, moving, options) <= ONE_BY_ONE_UP_TO:
-        shapes, pair_count = planes + shapes, with_planes
+        shapes, pair_count, among = planes + shapes, with_planes, together
     capacity = _capacity(pair_count, moving, options)
     one_by_one = capacity <= ONE_BY_ONE_UP_TO
-    groups = _groups(
-        [(entries[k].kind, static[entries[k].body]) for k in shapes], sizes, capacity if one_by_one else None
-    )
-    return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups, one_by_one)
+    groups = _groups(among, ignored, sizes, capacity if one_by_one else None)
+    return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups, one_by_one, ignored)
+
+
+def _possible(cells: Mapping[_Cell, int], ignored: Filter) -> Iterator[tuple[_Cell, _Cell, int]]:
+    """Cells whose shapes may collide, and how many pairs these are; the order of the kinds is kept."""
+    for (a, count_a), (b, count_b) in itertools.combinations_with_replacement(cells.items(), 2):
+        if not (a.static and b.static) and not ignored.ignores_classes(a.filter_class, b.filter_class):
+            yield a, b, count_a * (count_a - 1) // 2 if a == b else count_a * count_b
 
 
 def _capacity(pair_count: int, moving: int, options: Options) -> int:
@@ -92,31 +121,35 @@ def _capacity(pair_count: int, moving: int, options: Options) -> int:
 
 
 def _groups(
-    shapes: Sequence[tuple[str, bool]], sizes: Sequence[float], capacity: int | None
+    cells: Mapping[_Cell, int], ignored: Filter, sizes: Sequence[float], capacity: int | None
 ) -> tuple[CompactGroup, ...]:
     """Groups by kinds and by the number of moving bodies, those with one first, as in `solver.table.make_tables`.
 
     `capacity` is the number of pairs if each has a turn of its own, else None.
     """
-    kinds = list(dict.fromkeys(kind for kind, _ in shapes))
-    count = {key: sum(shape == key for shape in shapes) for key in set(shapes)}
+    kinds = list(dict.fromkeys(cell.kind for cell in cells))
+    count: collections.Counter[tuple[str, bool]] = collections.Counter()
+    for cell, shapes in cells.items():
+        count[cell.kind, cell.static] += shapes
+    possible: collections.Counter[tuple[str, str, int]] = collections.Counter()
+    for one, other, pairs in _possible(cells, ignored):
+        possible[one.kind, other.kind, 1 if one.static or other.static else 2] += pairs
     groups = []
     for side_count in (1, 2):
         for a, b in itertools.combinations_with_replacement(kinds, 2):
-            moving_a, moving_b = count.get((a, False), 0), count.get((b, False), 0)
-            fixed_a, fixed_b = count.get((a, True), 0), count.get((b, True), 0)
+            moving_a, moving_b = count[a, False], count[b, False]
+            fixed_a, fixed_b = count[a, True], count[b, True]
+            pairs = possible[a, b, side_count]
             if side_count == 2:
-                pairs = moving_a * (moving_a - 1) // 2 if a == b else moving_a * moving_b
                 widest = moving_a // 2 if a == b else min(moving_a, moving_b)
                 partners = max(moving_a, moving_b)
             else:
-                pairs = moving_a * fixed_a if a == b else moving_a * fixed_b + moving_b * fixed_a
                 widest = moving_a if a == b else (moving_a if fixed_b else 0) + (moving_b if fixed_a else 0)
                 partners = max(fixed_a, fixed_b)
             if pairs and (a, b) not in PAIRS:
                 raise ValueError(
                     f"build: shapes of the kinds {a} and {b} can not collide with each other; pass collides=False for the "
-                    "bodies of one of them"
+                    "bodies of one of them, or name both in ignore_collisions"
                 )
             if pairs:
                 tiers = (Tier(min(pairs, capacity), 1),) if capacity else _tiers(widest, partners, side_count, sizes)

@@ -9,6 +9,7 @@ import pytest
 
 from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, Planes, candidate_pairs
 from mathota_jax.collision.broadphase.choice import choose_method
+from mathota_jax.pair_filter import make_filter
 from mathota_jax.spatial.vector import Vec3
 from tests.marks import QUICK_AND_SLOW_PRECISION
 
@@ -83,6 +84,7 @@ def brute_force(bounds, admissible):
     low, high, center = (np.stack([np.asarray(c, float) for c in v]) for v in bounds[:3])
     radius = np.asarray(bounds.radius, float)
     excluded = {frozenset(pair) for pair in admissible.excluded}
+    classes, ignored = admissible.filter.classes, {frozenset(pair) for pair in admissible.filter.ignored}
     found = []
     for world in range(radius.shape[1]):
         pairs = {}
@@ -90,6 +92,8 @@ def brute_force(bounds, admissible):
             for j in range(i + 1, admissible.shape_count):
                 a, b = admissible.bodies[i], admissible.bodies[j]
                 if a == b or (admissible.static[i] and admissible.static[j]) or frozenset((a, b)) in excluded:
+                    continue
+                if ignored and frozenset((classes[a], classes[b])) in ignored:
                     continue
                 depth = np.min(
                     np.minimum(high[:, i, world], high[:, j, world]) - np.maximum(low[:, i, world], low[:, j, world])
@@ -160,7 +164,7 @@ def test_scenes_are_neither_empty_nor_full():
 
 @pytest.mark.parametrize("method", BROADPHASES)
 def test_inadmissible_pairs_are_left_out(method, float64):
-    """Compounds (several shapes on a body), static shapes in any place, pairs of bodies that are excluded."""
+    """Compounds (several shapes on a body), static shapes in any place, pairs of bodies that are excluded or ignored."""
     rng = np.random.default_rng(3)
     count = 50
     bodies = tuple(int(b) for b in rng.integers(0, 30, count))
@@ -168,6 +172,7 @@ def test_inadmissible_pairs_are_left_out(method, float64):
         bodies,
         tuple(body % 3 == 0 for body in bodies),
         tuple((a, b) for a in range(30) for b in range(a + 1, 30) if (a * b) % 5 == 1),
+        make_filter(30, [(frozenset(range(0, 30, 4)),) * 2, (frozenset(range(5)), frozenset(range(4, 30, 3)))]),
     )
     bounds = bounds_of(*cloud(rng, count, 0.3), np.float64)
     expected = brute_force(bounds, admissible)

@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.collision.broadphase.volumes import Bounds, overlaps, plane_overlaps
+from mathota_jax.pair_filter import NOTHING_IGNORED, Filter
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import settle, store
 
@@ -28,11 +29,13 @@ class Admissible:
       bodies: body of each shape; shapes of one body never collide.
       static: for each shape, whether its body never moves; static shapes never collide with each other.
       excluded: pairs of bodies (smaller handle first) that never collide, such as those that a joint connects.
+      filter: which others ignore each other.
     """
 
     bodies: tuple[int, ...]
     static: tuple[bool, ...]
     excluded: tuple[tuple[int, int], ...] = ()
+    filter: Filter = NOTHING_IGNORED
 
     def __post_init__(self) -> None:
         if len(self.bodies) > LARGEST_SHAPE_COUNT:
@@ -51,6 +54,9 @@ class Admissible:
         kept = (bodies[first] != bodies[second]) & ~(static[first] & static[second])
         if self.excluded:
             kept &= ~np.isin(self._body_key(bodies[first], bodies[second], np), self._excluded_keys)
+        if self.filter.ignored:
+            classes = self._classes
+            kept &= ~self.filter.table[classes[first], classes[second]]
         return first[kept].astype(np.int32), second[kept].astype(np.int32)
 
     def test(self, first: Array, second: Array) -> Array:
@@ -66,7 +72,14 @@ class Admissible:
             known = jnp.asarray(self._excluded_keys)
             place = jnp.searchsorted(known, key.reshape(-1)).reshape(key.shape)
             kept &= known[jnp.minimum(place, len(self._excluded_keys) - 1)] != key
+        if self.filter.ignored:
+            classes = jnp.asarray(self._classes)
+            kept &= ~jnp.asarray(self.filter.table)[classes[first], classes[second]]
         return kept
+
+    @functools.cached_property
+    def _classes(self) -> np.ndarray:
+        return np.asarray(self.filter.classes, np.int32)[np.asarray(self.bodies)]
 
     @functools.cached_property
     def _excluded_keys(self) -> np.ndarray:
