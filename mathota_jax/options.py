@@ -66,7 +66,7 @@ class Options:
         restitution pass. All figures: docs/solvers.md.
       exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the end of
         the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot stands on feet
-        of any mass, where there are up to 96 rows of contacts, motors, friction and stops together, no broadphase, and no
+        of any mass, where there are up to 192 rows of contacts, motors, friction and stops together, no broadphase, and no
         other joints. Elsewhere three and more joints, or fewer where a scene has nothing else to solve ("soft_step": there
         alone); one or two beside several contacts that bounce, and nets whose loops more than 96 rows close, are left to the
         solver. Off: absent. Limits, motors, springs and friction on their joints are solved with all that hangs on them, by

@@ -26,9 +26,9 @@ from mathota_jax.constraints.mechanism_rows import of_slots, own_mass, to_tables
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.row_matrix import Dense, Entries
+from mathota_jax.solver.row_matrix import Entries, Picked
 from mathota_jax.solver.rows import Rows
-from mathota_jax.solver.table import Table
+from mathota_jax.solver.table import EMPTY, Table
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
@@ -46,6 +46,23 @@ class _Sides(NamedTuple):
     blocks: tuple[int, ...]
 
 
+class _Class(NamedTuple):
+    """Constraints of one number of points; a table pads all to as many as its largest has.
+
+    Attributes:
+      members: numbers of the constraints in their table, turn by turn.
+      points: points of each.
+    """
+
+    members: tuple[int, ...]
+    points: int
+
+    def rows(self, table: Table, rows: int) -> np.ndarray:
+        """(member, point, row) places among the rows of the table, in the order turn, column, row; `rows` are of a point."""
+        columns = np.asarray(self.members)[:, None] * table.together + np.arange(self.points)
+        return columns[..., None] * rows + np.arange(rows)
+
+
 class Reduced(NamedTuple):
     """The rows of a step, reduced.
 
@@ -53,7 +70,7 @@ class Reduced(NamedTuple):
       sides: the rows on single bodies.
       velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
       matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
-      rows: one group for the rows with bounds on joints, if there are any, then one for each group of contacts.
+      rows: one group for the rows with bounds on joints, if there are any, then one for each class of each contact table.
     """
 
     sides: tuple[_Sides, ...]
@@ -67,11 +84,9 @@ class Reduced(NamedTuple):
 
     def with_biases(self, contacts: Sequence[Rows]) -> Reduced:
         """The same with those of `contacts`."""
-        count = len(self.rows) - len(contacts)
-        groups = (
-            dataclasses.replace(mine, bias=_by_constraint(group.table, group.bias))
-            for mine, group in zip(self.rows[count:], contacts, strict=True)
-        )
+        biases = _by_class([group.table for group in contacts], [group.bias for group in contacts])
+        count = len(self.rows) - len(biases)
+        groups = (dataclasses.replace(mine, bias=bias) for mine, bias in zip(self.rows[count:], biases, strict=True))
         return self._replace(rows=(*self.rows[:count], *groups))
 
     def change(self, impulses: Sequence[Array]) -> Array:
@@ -97,9 +112,7 @@ def reduce(scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows
     rows, first = [], len(bounded)
     if bounded:
         rows.append(_joint_group(joint_rows, bounded, matrix))
-    for group in contacts:
-        rows.append(_contact_group(group, matrix, first))
-        first += group.bias[..., 0].size
+    rows += _contact_groups(contacts, matrix, first)
     return Reduced(sides, velocity, matrix, tuple(rows))
 
 
@@ -108,8 +121,7 @@ def to_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]
     bounded = bounded_slots(scene)
     joints, contacts = values[: len(joint_rows)], values[len(joint_rows) :]
     found = [of_slots(joint_rows, bounded, joints)[:, None, None]] if bounded else []
-    tables = contact.contact_tables(scene)
-    return (*found, *(_by_constraint(table, value) for table, value in zip(tables, contacts, strict=True)))
+    return (*found, *_by_class(contact.contact_tables(scene), contacts))
 
 
 def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
@@ -120,14 +132,12 @@ def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Arra
         joints = to_tables(joint_rows, bounded, values[0][:, 0, 0])
     else:
         joints = tuple(jnp.zeros((*group.bias.shape[:-1], worlds), group.bias.dtype) for group in joint_rows)
-    tables = contact.contact_tables(scene)
-    contacts = values[len(values) - len(tables) :]
-    return (*joints, *(_by_turn(table, value) for table, value in zip(tables, contacts, strict=True)))
+    return (*joints, *_by_turn(contact.contact_tables(scene), values[bool(bounded) :]))
 
 
 def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows, ...], Array]:
     """Groups for the normals of the contacts alone, with the biases of `contacts`; the velocity under a unit impulse."""
-    groups = reduced.rows[len(reduced.rows) - len(contacts) :]
+    groups = reduced.rows[len(reduced.rows) - sum(len(_classes(group.table)) for group in contacts) :]
     first = len(reduced.matrix) - sum(group.bias[..., 0].size for group in groups)
     numbers = []
     for group in groups:
@@ -136,11 +146,7 @@ def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows,
         first += turns * rows * points
     chosen = np.concatenate(numbers)
     matrix = reduced.matrix[chosen][:, chosen]
-    found, first = [], 0
-    for group in contacts:
-        found.append(_contact_group(group, matrix, first))
-        first += group.bias[..., 0].size
-    return tuple(found), reduced.velocity[:, :, chosen]
+    return tuple(_contact_groups(contacts, matrix, 0)), reduced.velocity[:, :, chosen]
 
 
 def change(velocity: Array, impulses: Sequence[Array]) -> Array:
@@ -153,8 +159,13 @@ def _sides(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows], w
     """All rows that do not always hold."""
     slots = np.concatenate([group.table.order for group in joint_rows])
     place_of = {slot: place for place, slot in enumerate(slots.tolist())}
-    count = len(slots) + sum(group.bias[..., 0].size for group in contacts)
-    places = np.array([*(place_of[slot] for slot in bounded_slots(scene)), *range(len(slots), count)])
+    parts, first = [np.array([place_of[slot] for slot in bounded_slots(scene)], int)], len(slots)
+    for group in contacts:
+        parts += [
+            first + members.rows(group.table, group.bias.shape[1]).reshape(-1) for members in _classes(group.table)
+        ]
+        first += group.bias[..., 0].size
+    places = np.concatenate(parts)
     found = []
     for side in range(2):
         parts = [_side(group, side, worlds) for group in (*joint_rows, *contacts)]
@@ -213,8 +224,8 @@ def _group(table: Table, law: Bounded | Cone, bias: Array, matrix: Array, first:
         chosen = values[:, first : first + turns * rows * points]
         return chosen.reshape(count, turns, points, rows, -1).transpose(1, 3, 0, 2, 4)
 
-    own = by_turn(jnp.eye(count, dtype=matrix.dtype)[..., None])
-    return Rows(Dense((own,), (by_turn(matrix),)), bias, law, table)
+    starts = first + rows * points * np.arange(turns, dtype=np.int32)[:, None]
+    return Rows(Picked(by_turn(matrix), jnp.asarray(starts)), bias, law, table)  # type: ignore[arg-type]
 
 
 def _one_a_turn(turns: int, points: int) -> Table:
@@ -233,9 +244,18 @@ def _joint_group(joint_rows: Sequence[Rows], bounded: tuple[int, ...], matrix: A
     return _group(_one_a_turn(len(bounded), 1), law, bias, matrix, 0)
 
 
-def _contact_group(group: Rows, matrix: Array, first: int) -> Rows:
-    table = group.table
-    bias = _by_constraint(table, group.bias)
+def _contact_groups(contacts: Sequence[Rows], matrix: Array, first: int) -> list[Rows]:
+    """The groups of all contacts, whose rows start at `first`."""
+    found = []
+    for group in contacts:
+        for members in _classes(group.table):
+            found.append(_contact_group(group, members, matrix, first))
+            first += found[-1].bias[..., 0].size
+    return found
+
+
+def _contact_group(group: Rows, members: _Class, matrix: Array, first: int) -> Rows:
+    bias = _of_class(group.table, members, group.bias)
     turns, rows, points = bias.shape[:3]
     size = rows * points
     starts = [first + size * turn for turn in range(turns)]
@@ -243,10 +263,10 @@ def _contact_group(group: Rows, matrix: Array, first: int) -> Rows:
     own = lax.stop_gradient(own).reshape(turns, size, points, rows, -1)
 
     def of_points(values: Array) -> Array:
-        return values.reshape(turns, points, values.shape[-1])
+        return _of_class(group.table, members, values[:, None])[:, 0]
 
     law = group.law
-    mass = of_points(law.normal_mass if isinstance(law, Cone) else law.effective_mass)
+    mass = of_points(law.normal_mass if isinstance(law, Cone) else law.effective_mass[:, 0])
     active = jnp.broadcast_to(jnp.where(mass > 0, 1.0, 0.0), (turns, points, own.shape[-1])).astype(own.dtype)
     entries = _entries(own)
     normal = safe_divide(active, normal_bound(entries, points, active))
@@ -294,15 +314,43 @@ def _convergent(own: Array, normal: Array, tangent: Array, active: Array) -> Arr
     return jnp.minimum(1.0, safe_divide(jnp.full_like(bound, LARGEST_STEP), bound))[:, None]
 
 
-def _by_constraint(table: Table, values: Array) -> Array:
-    """(turn * constraint, row, point, world) from (turn, row, column, world)."""
+@functools.cache
+def _classes(table: Table) -> tuple[_Class, ...]:
+    """The constraints of a table by their number of points; padding is none."""
+    points = (table.order.reshape(-1, table.together) != EMPTY).sum(1)
+    return tuple(_Class(tuple(np.flatnonzero(points == n).tolist()), n) for n in sorted(set(points.tolist()) - {0}))
+
+
+def _of_class(table: Table, members: _Class, values: Array) -> Array:
+    """(member, row, point, world) from (turn, row, column, world)."""
     turns, rows, columns, worlds = values.shape
     split = values.reshape(turns, rows, columns // table.together, table.together, worlds)
-    return jnp.moveaxis(split, 1, 2).reshape(-1, rows, table.together, worlds)
+    of_all = jnp.moveaxis(split, 1, 2).reshape(-1, rows, table.together, worlds)
+    return take(of_all, members.members)[:, :, : members.points]
 
 
-def _by_turn(table: Table, values: Array) -> Array:
-    """The reverse."""
-    _, rows, points, worlds = values.shape
-    split = values.reshape(table.turn_count, -1, rows, points, worlds)
-    return jnp.moveaxis(split, 2, 1).reshape(table.turn_count, rows, -1, worlds)
+def _by_class(tables: Sequence[Table], values: Sequence[Array]) -> list[Array]:
+    """(member, row, point, world) of all classes from (turn, row, column, world) of the tables."""
+    pairs = zip(tables, values, strict=True)
+    return [_of_class(table, members, value) for table, value in pairs for members in _classes(table)]
+
+
+def _by_turn(tables: Sequence[Table], values: Sequence[Array]) -> list[Array]:
+    """The reverse; 0 for padding."""
+    found, left = [], list(values)
+    for table in tables:
+        classes = _classes(table)
+        parts, left = left[: len(classes)], left[len(classes) :]
+        widths = [(0, table.together - members.points) for members in classes]
+        padded = [jnp.pad(part, ((0, 0), (0, 0), width, (0, 0))) for part, width in zip(parts, widths, strict=True)]
+        count = table.order.size // table.together
+        solved = np.concatenate([members.members for members in classes])
+        place = np.full(count, len(solved))
+        place[solved] = np.arange(len(solved))
+        if len(solved) < count:
+            padded.append(jnp.zeros_like(padded[0][:1]))
+        of_all = take(jnp.concatenate(padded), place)
+        rows, worlds = of_all.shape[1], of_all.shape[-1]
+        split = of_all.reshape(table.turn_count, -1, rows, table.together, worlds)
+        found.append(jnp.moveaxis(split, 2, 1).reshape(table.turn_count, rows, -1, worlds))
+    return found

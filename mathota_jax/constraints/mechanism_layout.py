@@ -11,6 +11,7 @@ import numpy as np
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import JointGroup, joint_groups, joint_row_count
 from mathota_jax.scene import Scene
+from mathota_jax.solver.table import EMPTY
 from mathota_jax.solver.tree import GROUND, Tree
 
 _Slots = tuple[tuple[int, ...], tuple[int, ...]]
@@ -19,7 +20,7 @@ LEAST_JOINTS = 3
 """Joints of the smallest mechanism beside rows that are swept in turn with it: two converge in a few sweeps, which are
 cheaper. Elsewhere one is enough."""
 
-MOST_ROWS = 96
+MOST_ROWS = 192
 """Rows of contacts and with bounds of the largest scene in which they are solved with the joints held: the matrix grows with
 their square."""
 
@@ -178,8 +179,8 @@ def _takes_contacts(scene: Scene, found: Layout) -> bool:
     if _row_count(found) + len(bounded) != joint_row_count(scene):
         return False
     on_links = any(set(found.blocks) & set(blocks) for table in tables for side in table.blocks for blocks in side)
-    columns = sum(table.turn_count * table.column_count for table in tables)
-    return on_links and len(bounded) + columns * (3 if scene.friction else 1) <= MOST_ROWS
+    points = sum(int((table.order != EMPTY).sum()) for table in tables)
+    return on_links and len(bounded) + points * (3 if scene.friction else 1) <= MOST_ROWS
 
 
 def _row_count(found: Layout) -> int:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import InverseInertia, unpack_inverse
@@ -188,6 +189,42 @@ class Points:
         """(..., 1, 1, column, world) from (..., constraint, world)."""
         together = self.packed.shape[-2] // values.shape[-2]
         return jnp.repeat(values, together, axis=-2)[..., None, None, :, :]
+
+
+@pytree
+class Picked:
+    """Rows whose Jacobian picks one component each of the only block, for the sweeps alone.
+
+    Attributes:
+      response: ``M^-1 J^T`` (..., row, component, column, world).
+      first: (..., 1) int32 component of the first column of a turn; the others follow column by column, row by row.
+    """
+
+    response: Array
+    first: Array
+
+    @property
+    def like(self) -> Array:
+        """A finite array (..., row, column, world)."""
+        return self.response[..., 0, :, :]
+
+    def rates(self, velocities: Sequence[Array]) -> Array:
+        """As `Dense.rates`, of one turn."""
+        rows, _, columns, _ = self.response.shape
+        (velocity,) = velocities
+        own = jax.lax.dynamic_slice_in_dim(velocity[:, 0], self.first[0], rows * columns)
+        return jnp.swapaxes(own.reshape(columns, rows, -1), 0, 1)
+
+    def changes(self, impulse: Array, together: int) -> list[Array]:
+        """As `Dense.changes`."""
+        return [_sum(self.response, impulse, together)]
+
+    def dense(self) -> Dense:
+        """The same rows with all entries; turns, no single one."""
+        _, rows, count, columns, _ = self.response.shape
+        own = self.first[..., None] + np.arange(rows)[:, None] + rows * np.arange(columns)
+        picks = own[:, :, None, :, None] == np.arange(count)[:, None, None]
+        return Dense((jnp.where(picks, 1.0, 0.0).astype(self.response.dtype),), (self.response,))
 
 
 @pytree

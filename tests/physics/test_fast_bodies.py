@@ -14,6 +14,7 @@ from mathota_jax import (
     Capsule,
     Cone,
     Cylinder,
+    Flag,
     Options,
     Plane,
     Polyhedron,
@@ -21,6 +22,7 @@ from mathota_jax import (
     Sphere,
     step,
 )
+from tests.benchmarks import hard_scenes
 from tests.marks import slow_but
 from tests.scenes import (
     advance,
@@ -147,6 +149,34 @@ def test_a_spinning_stick_does_not_fall_through_the_ground():
     states = shots(state, 100.0, np.random.default_rng(3).uniform(-50, 50, RUNS))
     states = dataclasses.replace(states, position=states.position.at[:, 1, 0].add(-2.0))
     assert not escapes(model, states, steps=40).any()
+
+
+@pytest.mark.slow
+def test_nothing_of_a_struck_stack_passes_the_wall_behind_it():
+    """B12b: 1000 balls at 50 to 500 m/s, at all heights and from up to 30 degrees beside the normal, at ten cubes."""
+    model, state = hard_scenes.bullet_against_stack(undamped(dt=DT, continuous=True))
+    rng = np.random.default_rng(6)
+    speed, angle = 50.0 * 10 ** rng.uniform(0, 1, RUNS), np.radians(rng.uniform(-30, 30, RUNS))
+    heading = np.stack([np.cos(angle), rng.uniform(-0.1, 0.1, RUNS), np.sin(angle)], axis=-1)
+    aim = np.stack([np.zeros(RUNS), rng.uniform(0.3, 9.5, RUNS), rng.uniform(-0.6, 0.6, RUNS)], axis=-1)
+    start = aim - heading * rng.uniform(1.0, 4.0, RUNS)[:, None]
+    start[:, 1] = np.maximum(start[:, 1], 0.3)
+    ball = model.scene.body_count - 1
+    states = repeat(state, RUNS)
+    states = dataclasses.replace(
+        states,
+        position=states.position.at[:, ball].set(start),
+        velocity=states.velocity.at[:, ball].set(heading * speed[:, None]),
+        angular_velocity=states.angular_velocity.at[:, ball].set(rng.normal(size=(RUNS, 3)) * 10.0),
+    )
+    final, record = record_worlds(repeat(model, RUNS), states, 30, motion)
+    assert not np.any(np.asarray(final.flags) & int(Flag.NON_FINITE))
+    place = np.asarray(record["position"])[:, :, 2:]
+    struck = np.abs(place[-1, :, :-1, 0]).max(-1) > 1.0
+    assert struck.mean() > 0.5, "most stacks are hit"
+    behind = (place[..., 0] > 10.0) & (place[..., 1] < 20.0) & (np.abs(place[..., 2]) < 10.0)
+    assert not behind.any(), f"{behind.any((0, 2)).sum()} of {RUNS} runs"
+    assert (place[..., 1] > 0.0).all(), "nothing falls through the ground"
 
 
 @pytest.mark.parametrize("shape", ["sphere", pytest.param("box", marks=pytest.mark.slow)])

@@ -76,7 +76,7 @@ def test_other_worlds_bounce_as_ever():
         ((), jax.jacfwd),
         ((), jax.jacrev),
         pytest.param((1.0,), jax.jacfwd, marks=pytest.mark.slow),
-        ((1.0,), jax.jacrev),
+        pytest.param((1.0,), jax.jacrev, marks=pytest.mark.slow),
     ],
     ids=["free-jacfwd", "free-jacrev", "welded-jacfwd", "welded-jacrev"],
 )
