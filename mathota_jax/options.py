@@ -71,7 +71,7 @@ class Options:
         alone); one or two beside several contacts that bounce, and nets whose loops more than 96 rows close, are left to the
         solver. Off: absent. Limits, motors, springs and friction on their joints are solved with all that hangs on them, by
         `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred times as heavy as its first
-        link, a stop or a spring acts as it would on one rigid body.
+        link, a stop or a spring acts as it would on one rigid body. Springs and servos may be as stiff as they like.
         Without it an error travels one joint a sweep: ten links at 1/240 s part by 5e-3 of a link and twenty at 1/60 s gain
         energy without bound; with it no gap is left but round-off. A step of ten links with "pgs" takes 1.2 times as long.
       substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.

@@ -73,6 +73,11 @@ FEATURES = (
         "physics/test_mechanism_contacts.py",
     ),
     Feature(
+        "springs and servos of any stiffness",
+        "mathota_jax.constraints:mechanism_drives",
+        "physics/test_stiff_drives.py",
+    ),
+    Feature(
         "closed loops of joints solved exactly", "mathota_jax.constraints:mechanism_loops", "physics/test_loops.py"
     ),
     Feature("steps split at their impacts", "mathota_jax:impact_splitting", "physics/test_impact_events.py"),

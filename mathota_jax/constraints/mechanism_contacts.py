@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import contact, mechanism, mechanism_links
+from mathota_jax.constraints import contact, mechanism, mechanism_drives, mechanism_links
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
+from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import bounded_slots
 from mathota_jax.constraints.mechanism_rows import of_slots, own_mass, to_tables
 from mathota_jax.scene import Scene
@@ -29,7 +30,7 @@ from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Entries, Picked
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY, Table
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_scaled, add_slices, repeat_worlds, spread
@@ -112,7 +113,7 @@ def reduce(scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows
     rows, first = [], len(bounded)
     if bounded:
         rows.append(_joint_group(joint_rows, bounded, matrix))
-    rows += _contact_groups(contacts, matrix, first)
+    rows += contact_groups(contacts, matrix, first)
     return Reduced(sides, velocity, matrix, tuple(rows))
 
 
@@ -122,6 +123,50 @@ def to_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]
     joints, contacts = values[: len(joint_rows)], values[len(joint_rows) :]
     found = [of_slots(joint_rows, bounded, joints)[:, None, None]] if bounded else []
     return (*found, *_by_class(contact.contact_tables(scene), contacts))
+
+
+def closer_start(
+    scene: Scene,
+    joints: JointRows,
+    contacts: Sequence[Rows],
+    reduced: Reduced,
+    rates: Array,
+    impulses: tuple[Array, ...],
+) -> tuple[Array, ...]:
+    """Impulses of the reduced groups from which to sweep over all of them, without derivative; see `mechanism_drives`.
+
+    Args:
+      scene: whose mechanisms take contacts.
+      joints: all joint rows, of which the laws matter.
+      contacts: all contacts.
+      reduced: all rows, reduced.
+      rates: (row, 1, world) without impulses.
+      impulses: of the last step.
+    """
+    bounded = bounded_slots(scene)
+    laws = joints.laws[np.asarray(bounded, int)]
+    if not mechanism_drives.are_stiff(laws):
+        return impulses
+    reduced, contacts, rates = lax.stop_gradient((reduced, tuple(contacts), rates[:, 0]))
+    law, bias = jax.tree.map(lambda x: x[:, 0, 0], (reduced.rows[0].law, reduced.rows[0].bias))
+    worlds = max(bias.shape[-1], rates.shape[-1])
+    errors = jnp.concatenate(in_every_world([rates[: len(bounded)] + bias, rates[len(bounded) :]], worlds))
+
+    def solve_all(_: Array, impulses: tuple[Array, ...]) -> tuple[Array, ...]:
+        old, *begin = impulses
+        found = mechanism_drives.eliminate(laws, law, reduced.matrix, errors, old[:, 0, 0])
+        scalar = found.left[found.left < len(bounded)]
+        groups = contact_groups(contacts, found.matrix, len(scalar))
+        if len(scalar):
+            # Their errors have their biases already.
+            groups.insert(0, scalar_group(take(law, scalar), jnp.zeros_like(take(bias, scalar)), found.matrix))
+            begin.insert(0, take(old, scalar))
+        sweeps = scene.options.velocity_iterations
+        swept = pgs.solve(sweeps, 1, tuple(groups), found.errors[:, None], tuple(begin))[1]
+        in_order = jnp.concatenate([jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in swept])
+        return found.impulses(old[:, 0, 0], in_order)[:, None, None], *swept[bool(len(scalar)) :]
+
+    return lax.fori_loop(0, mechanism_drives.passes(laws), solve_all, in_every_world(impulses, worlds))
 
 
 def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
@@ -146,7 +191,7 @@ def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows,
         first += turns * rows * points
     chosen = np.concatenate(numbers)
     matrix = reduced.matrix[chosen][:, chosen]
-    return tuple(_contact_groups(contacts, matrix, 0)), reduced.velocity[:, :, chosen]
+    return tuple(contact_groups(contacts, matrix, 0)), reduced.velocity[:, :, chosen]
 
 
 def change(velocity: Array, impulses: Sequence[Array]) -> Array:
@@ -235,16 +280,20 @@ def _one_a_turn(turns: int, points: int) -> Table:
 
 def _joint_group(joint_rows: Sequence[Rows], bounded: tuple[int, ...], matrix: Array) -> Rows:
     law = jax.tree.map(lambda *parts: of_slots(joint_rows, bounded, parts), *(group.law for group in joint_rows))
-    bias = of_slots(joint_rows, bounded, [group.bias for group in joint_rows])
+    return scalar_group(law, of_slots(joint_rows, bounded, [group.bias for group in joint_rows]), matrix)
+
+
+def scalar_group(law: Bounded, bias: Array, matrix: Array) -> Rows:
+    """The first rows of a matrix, one after the other; law and bias (row, world), the masses those of two bodies alone."""
     works = law.effective_mass > 0
-    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(bounded)))
+    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(bias)))
     mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
     law = Bounded(mass, law.softness, law.lower, law.upper)
     law, bias = jax.tree.map(lambda x: jnp.broadcast_to(x, mass.shape)[:, None, None], (law, bias))
-    return _group(_one_a_turn(len(bounded), 1), law, bias, matrix, 0)
+    return _group(_one_a_turn(len(bias), 1), law, bias, matrix, 0)
 
 
-def _contact_groups(contacts: Sequence[Rows], matrix: Array, first: int) -> list[Rows]:
+def contact_groups(contacts: Sequence[Rows], matrix: Array, first: int) -> list[Rows]:
     """The groups of all contacts, whose rows start at `first`."""
     found = []
     for group in contacts:

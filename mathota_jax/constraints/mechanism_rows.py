@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import mechanism, mechanism_links
+from mathota_jax.constraints import mechanism, mechanism_drives, mechanism_links
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
@@ -76,6 +76,7 @@ def solve(
     responses: Responses,
     joint_rows: Sequence[Rows],
     slots: tuple[int, ...],
+    laws: np.ndarray,
     sweeps: int,
     velocity: Array,
     impulses: tuple[Array, ...],
@@ -87,6 +88,7 @@ def solve(
       responses: to these rows.
       joint_rows: all joint rows.
       slots: of the rows to solve.
+      laws: static names of the laws of these.
       sweeps: over these rows.
       velocity: (component, block, world) with `impulses`, along which the joints hold.
       impulses: of the joint groups.
@@ -99,12 +101,34 @@ def solve(
     law = jax.tree.map(lambda *parts: of_slots(joint_rows, slots, parts), *(group.law for group in joint_rows))
     error = of_slots(joint_rows, slots, [group.bias + row_velocity(group, velocity) for group in joint_rows])
     old, first = (of_slots(joint_rows, slots, values) for values in (impulses, start))
+    without = error - add_scaled(responses.matrix, old)
+    first = _closer_start(sweeps, laws, law, responses.matrix, without, first)
     ahead = first - old
     error = error + add_scaled(responses.matrix, ahead)
     new = _sweep(sweeps, responses.matrix, law, *jnp.broadcast_arrays(first, error))
     change = new - old
     moved = velocity + add_scaled(responses.velocity, change)
     return moved, to_tables(joint_rows, slots, change)
+
+
+def _closer_start(sweeps: int, laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, impulses: Array) -> Array:
+    """Impulses (row, world) from which to sweep over all rows, see `mechanism_drives`; `errors` are without any.
+
+    Differentiable: where they solve the rows, few sweeps would not find the derivative either.
+    """
+    if not mechanism_drives.are_stiff(laws):
+        return impulses
+
+    def solve_all(impulses: Array, _: None) -> tuple[Array, None]:
+        found = mechanism_drives.eliminate(laws, law, matrix, errors, impulses)
+        swept = take(impulses, found.left)
+        if len(found.left):
+            start = jnp.broadcast_arrays(swept, found.errors + add_scaled(found.matrix, swept))
+            swept = _sweep(sweeps, found.matrix, take(law, found.left), *start)
+        return found.impulses(impulses, swept), None
+
+    impulses = jnp.broadcast_arrays(impulses, errors)[0]
+    return lax.scan(solve_all, impulses, None, length=mechanism_drives.passes(laws))[0]
 
 
 def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:
