@@ -152,9 +152,11 @@ def closer_start(
     worlds = max(bias.shape[-1], rates.shape[-1])
     errors = jnp.concatenate(in_every_world([rates[: len(bounded)] + bias, rates[len(bounded) :]], worlds))
 
-    def solve_all(_: Array, impulses: tuple[Array, ...]) -> tuple[Array, ...]:
-        old, *begin = impulses
-        found = mechanism_drives.eliminate(laws, law, reduced.matrix, errors, old[:, 0, 0])
+    impulses = in_every_world(impulses, worlds)
+
+    def solve_all(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
+        (old, *begin), pushes = impulses, before[0][0][:, 0, 0]
+        found = mechanism_drives.eliminate(laws, law, reduced.matrix, errors, pushes)
         scalar = found.left[found.left < len(bounded)]
         groups = contact_groups(contacts, found.matrix, len(scalar))
         if len(scalar):
@@ -163,10 +165,36 @@ def closer_start(
             begin.insert(0, take(old, scalar))
         sweeps = scene.options.velocity_iterations
         swept = pgs.solve(sweeps, 1, tuple(groups), found.errors[:, None], tuple(begin))[1]
-        in_order = jnp.concatenate([jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in swept])
-        return found.impulses(old[:, 0, 0], in_order)[:, None, None], *swept[bool(len(scalar)) :]
+        pushes, solved = found.impulses(pushes, _in_order(swept))
+        return (pushes[:, None, None], *swept[bool(len(scalar)) :]), solved
 
-    return lax.fori_loop(0, mechanism_drives.passes(laws), solve_all, in_every_world(impulses, worlds))
+    start = (impulses, jnp.zeros_like(errors[0]))
+    found, solved = lax.fori_loop(0, mechanism_drives.passes(laws), solve_all, start)
+    left = [_left_to_do(reduced, rates, values) for values in (found, impulses)]
+    return jax.tree.map(functools.partial(jnp.where, mechanism_drives.are_better(solved, *left)), found, impulses)
+
+
+def _left_to_do(reduced: Reduced, rates: Array, impulses: Sequence[Array]) -> Array:
+    """Energy (world,) of what one more update of each row alone would change; `rates` (row, world) without impulses."""
+    rates = rates + add_scaled(reduced.matrix, _in_order(impulses))
+    total, first = jnp.zeros(rates.shape[-1], rates.dtype), 0
+    for group, impulse in zip(reduced.rows, impulses, strict=True):
+        turns, rows, points, worlds = impulse.shape
+        own = rates[first : first + turns * rows * points].reshape(turns, points, rows, worlds)
+        change = group.law.update(impulse, group.bias + jnp.swapaxes(own, 1, 2)) - impulse
+        law = group.law
+        masses = (
+            [law.normal_mass, law.tangent_mass, law.tangent_mass] if isinstance(law, Cone) else [law.effective_mass]
+        )
+        mass = jnp.stack(masses, axis=1) if isinstance(law, Cone) else masses[0]
+        total = total + safe_divide(change * change, jnp.broadcast_to(mass, change.shape)).sum((0, 1, 2))
+        first += turns * rows * points
+    return total
+
+
+def _in_order(impulses: Sequence[Array]) -> Array:
+    """(row, world) in the order of the reduced rows, from those of their groups."""
+    return jnp.concatenate([jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in impulses])
 
 
 def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
@@ -196,8 +224,7 @@ def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows,
 
 def change(velocity: Array, impulses: Sequence[Array]) -> Array:
     """(component, block, world) from those under unit impulses of rows (component, block, row, world), and impulses."""
-    in_order = [jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in impulses]
-    return add_scaled(velocity, jnp.concatenate(in_order))
+    return add_scaled(velocity, _in_order(impulses))
 
 
 def _sides(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows], worlds: int) -> tuple[_Sides, ...]:

@@ -34,6 +34,14 @@ def are_stiff(laws: np.ndarray) -> bool:
     return bool(np.isin(laws, STIFF).any())
 
 
+def are_better(solved: Array, left_by_new: Array, left_by_old: Array) -> Array:
+    """Worlds to start from new impulses: where they solve all rows (1, else 0), or leave less to do than the old ones.
+
+    They may not where servos meet their caps one after the other, or where a stop takes up what a stiff one would give.
+    """
+    return settle(jnp.where(left_by_new < left_by_old, 1.0, solved)) > 0.5
+
+
 def passes(laws: np.ndarray) -> int:
     """How often to solve: a servo that meets its bound does not carry what the others were told that it would."""
     return 2 if SERVO in laws else 1
@@ -61,14 +69,18 @@ class Elimination(NamedTuple):
     free: Array
     law: Bounded
 
-    def impulses(self, old: Array, of_left: Array) -> Array:
-        """All scalar rows (row, world), in order, from `old` ones and those of the rows that are left (row, world)."""
+    def impulses(self, old: Array, of_left: Array) -> tuple[Array, Array]:
+        """All scalar rows (row, world), in order, from `old` ones and those of the rows that are left (row, world).
+
+        Also where (world,) no bound is met that was not met before, so that these solve all rows.
+        """
         pushes = self.alone - add_scaled(self.by_left, of_left) if len(self.left) else self.alone
-        law = take((self.law.lower, self.law.upper), self.soft)
-        pushes = jnp.where(self.free > 0.5, jnp.clip(pushes, *law), take(old, self.soft))
+        lower, upper = take((self.law.lower, self.law.upper), self.soft)
+        met = settle(jnp.where((pushes < lower) | (pushes > upper), self.free, 0.0))
+        pushes = jnp.where(self.free > 0.5, jnp.clip(pushes, lower, upper), take(old, self.soft))
         scalar = self.left[: len(old) - len(self.soft)]
         place = np.argsort(np.concatenate([self.soft, scalar]))
-        return take(jnp.concatenate([pushes, of_left[: len(scalar)]]), place)
+        return take(jnp.concatenate([pushes, of_left[: len(scalar)]]), place), 1.0 - met.max(0)
 
 
 def eliminate(laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, old: Array) -> Elimination:

@@ -25,6 +25,7 @@ from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_changes, row_velocity
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_scaled, repeat_worlds
 
@@ -119,16 +120,27 @@ def _closer_start(sweeps: int, laws: np.ndarray, law: Bounded, matrix: Array, er
     if not mechanism_drives.are_stiff(laws):
         return impulses
 
-    def solve_all(impulses: Array, _: None) -> tuple[Array, None]:
-        found = mechanism_drives.eliminate(laws, law, matrix, errors, impulses)
+    impulses = jnp.broadcast_arrays(impulses, errors)[0]
+
+    def solve_all(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        pushes = before[0]
+        found = mechanism_drives.eliminate(laws, law, matrix, errors, pushes)
         swept = take(impulses, found.left)
         if len(found.left):
-            start = jnp.broadcast_arrays(swept, found.errors + add_scaled(found.matrix, swept))
-            swept = _sweep(sweeps, found.matrix, take(law, found.left), *start)
-        return found.impulses(impulses, swept), None
+            start = found.errors + add_scaled(found.matrix, swept)
+            swept = _sweep(sweeps, found.matrix, take(law, found.left), swept, start)
+        return found.impulses(pushes, swept), None
 
-    impulses = jnp.broadcast_arrays(impulses, errors)[0]
-    return lax.scan(solve_all, impulses, None, length=mechanism_drives.passes(laws))[0]
+    def left_to_do(impulses: Array) -> Array:
+        """Energy (world,) of what one more update of each row alone would change."""
+        alone = _with_tree(matrix, law, impulses)
+        change = alone.update(impulses, errors + add_scaled(matrix, impulses)) - impulses
+        return safe_divide(change * change, alone.effective_mass).sum(0)
+
+    start = (impulses, jnp.zeros_like(impulses[0]))
+    found, solved = lax.scan(solve_all, start, None, length=mechanism_drives.passes(laws))[0]
+    better = mechanism_drives.are_better(*lax.stop_gradient((solved, left_to_do(found), left_to_do(impulses))))
+    return jnp.where(better, found, impulses)
 
 
 def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:
@@ -188,11 +200,7 @@ def _slot_count(joint_rows: Sequence[Rows]) -> int:
 
 def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Array) -> Array:
     """Impulses (row, world) after projected Gauss-Seidel sweeps over a dense matrix (row, row, world)."""
-    works = law.effective_mass > 0
-    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(matrix)))
-    mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
-    law = Bounded(mass, law.softness, law.lower, law.upper)
-    law = jax.tree.map(lambda x: jnp.broadcast_to(x, impulse.shape), law)
+    law = _with_tree(matrix, law, impulse)
 
     def turn(carry: tuple[Array, Array], row: tuple) -> tuple[tuple[Array, Array], None]:
         impulse, error = carry
@@ -204,3 +212,12 @@ def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Arra
         return lax.scan(turn, carry, (jnp.arange(len(matrix)), jnp.swapaxes(matrix, 0, 1), law))
 
     return lax.scan(sweep, (impulse, error), None, length=sweeps)[0][0]
+
+
+def _with_tree(matrix: Array, law: Bounded, like: Array) -> Bounded:
+    """The laws of rows (row, world) with the masses of all that hangs on them."""
+    works = law.effective_mass > 0
+    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(matrix)))
+    mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
+    law = Bounded(mass, law.softness, law.lower, law.upper)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, like.shape), law)
