@@ -24,6 +24,7 @@ from mathota_jax.constraints import (
     mechanism_correction,
     mechanism_links,
     mechanism_rows,
+    mechanism_start,
     motor,
     rebound_limit,
 )
@@ -228,7 +229,7 @@ def _solve_reduced(
     rates = reduced.rates(begin.with_joints)
     if problem.joints is not None:
         contacts = [group.rows for group in problem.contact_rows]
-        first = mechanism_contacts.closer_start(scene, problem.joints, contacts, reduced, rates, first)
+        first = mechanism_start.closer_start(scene, problem.joints, contacts, reduced, rates, first)
     found = _sweep(scene, reduced.rows, rates, first, known=False)[1]
     impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, found)
     # What the joints take for it; the velocity is known better than their large impulses on light links would have it.

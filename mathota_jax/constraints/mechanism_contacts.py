@@ -19,18 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import contact, mechanism, mechanism_drives, mechanism_links
+from mathota_jax.constraints import contact, mechanism, mechanism_links
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
-from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import bounded_slots
-from mathota_jax.constraints.mechanism_rows import of_slots, own_mass, to_tables
+from mathota_jax.constraints.mechanism_rows import of_slots, to_tables, with_tree
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Entries, Picked
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY, Table
-from mathota_jax.spatial.indexing import in_every_world, take
+from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_scaled, add_slices, repeat_worlds, spread
@@ -125,74 +124,7 @@ def to_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]
     return (*found, *_by_class(contact.contact_tables(scene), contacts))
 
 
-def closer_start(
-    scene: Scene,
-    joints: JointRows,
-    contacts: Sequence[Rows],
-    reduced: Reduced,
-    rates: Array,
-    impulses: tuple[Array, ...],
-) -> tuple[Array, ...]:
-    """Impulses of the reduced groups from which to sweep over all of them, without derivative; see `mechanism_drives`.
-
-    Args:
-      scene: whose mechanisms take contacts.
-      joints: all joint rows, of which the laws matter.
-      contacts: all contacts.
-      reduced: all rows, reduced.
-      rates: (row, 1, world) without impulses.
-      impulses: of the last step.
-    """
-    bounded = bounded_slots(scene)
-    laws = joints.laws[np.asarray(bounded, int)]
-    if not mechanism_drives.are_stiff(laws):
-        return impulses
-    reduced, contacts, rates = lax.stop_gradient((reduced, tuple(contacts), rates[:, 0]))
-    law, bias = jax.tree.map(lambda x: x[:, 0, 0], (reduced.rows[0].law, reduced.rows[0].bias))
-    worlds = max(bias.shape[-1], rates.shape[-1])
-    errors = jnp.concatenate(in_every_world([rates[: len(bounded)] + bias, rates[len(bounded) :]], worlds))
-
-    impulses = in_every_world(impulses, worlds)
-
-    def solve_all(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
-        (old, *begin), pushes = impulses, before[0][0][:, 0, 0]
-        found = mechanism_drives.eliminate(laws, law, reduced.matrix, errors, pushes)
-        scalar = found.left[found.left < len(bounded)]
-        groups = contact_groups(contacts, found.matrix, len(scalar))
-        if len(scalar):
-            # Their errors have their biases already.
-            groups.insert(0, scalar_group(take(law, scalar), jnp.zeros_like(take(bias, scalar)), found.matrix))
-            begin.insert(0, take(old, scalar))
-        sweeps = scene.options.velocity_iterations
-        swept = pgs.solve(sweeps, 1, tuple(groups), found.errors[:, None], tuple(begin))[1]
-        pushes, solved = found.impulses(pushes, _in_order(swept))
-        return (pushes[:, None, None], *swept[bool(len(scalar)) :]), solved
-
-    start = (impulses, jnp.zeros_like(errors[0]))
-    found, solved = lax.fori_loop(0, mechanism_drives.passes(laws), solve_all, start)
-    left = [_left_to_do(reduced, rates, values) for values in (found, impulses)]
-    return jax.tree.map(functools.partial(jnp.where, mechanism_drives.are_better(solved, *left)), found, impulses)
-
-
-def _left_to_do(reduced: Reduced, rates: Array, impulses: Sequence[Array]) -> Array:
-    """Energy (world,) of what one more update of each row alone would change; `rates` (row, world) without impulses."""
-    rates = rates + add_scaled(reduced.matrix, _in_order(impulses))
-    total, first = jnp.zeros(rates.shape[-1], rates.dtype), 0
-    for group, impulse in zip(reduced.rows, impulses, strict=True):
-        turns, rows, points, worlds = impulse.shape
-        own = rates[first : first + turns * rows * points].reshape(turns, points, rows, worlds)
-        change = group.law.update(impulse, group.bias + jnp.swapaxes(own, 1, 2)) - impulse
-        law = group.law
-        masses = (
-            [law.normal_mass, law.tangent_mass, law.tangent_mass] if isinstance(law, Cone) else [law.effective_mass]
-        )
-        mass = jnp.stack(masses, axis=1) if isinstance(law, Cone) else masses[0]
-        total = total + safe_divide(change * change, jnp.broadcast_to(mass, change.shape)).sum((0, 1, 2))
-        first += turns * rows * points
-    return total
-
-
-def _in_order(impulses: Sequence[Array]) -> Array:
+def in_order(impulses: Sequence[Array]) -> Array:
     """(row, world) in the order of the reduced rows, from those of their groups."""
     return jnp.concatenate([jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in impulses])
 
@@ -224,7 +156,7 @@ def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows,
 
 def change(velocity: Array, impulses: Sequence[Array]) -> Array:
     """(component, block, world) from those under unit impulses of rows (component, block, row, world), and impulses."""
-    return add_scaled(velocity, _in_order(impulses))
+    return add_scaled(velocity, in_order(impulses))
 
 
 def _sides(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows], worlds: int) -> tuple[_Sides, ...]:
@@ -312,11 +244,8 @@ def _joint_group(joint_rows: Sequence[Rows], bounded: tuple[int, ...], matrix: A
 
 def scalar_group(law: Bounded, bias: Array, matrix: Array) -> Rows:
     """The first rows of a matrix, one after the other; law and bias (row, world), the masses those of two bodies alone."""
-    works = law.effective_mass > 0
-    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(bias)))
-    mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
-    law = Bounded(mass, law.softness, law.lower, law.upper)
-    law, bias = jax.tree.map(lambda x: jnp.broadcast_to(x, mass.shape)[:, None, None], (law, bias))
+    law = with_tree(matrix, law, len(bias))
+    law, bias = jax.tree.map(lambda x: jnp.broadcast_to(x, law.softness.shape)[:, None, None], (law, bias))
     return _group(_one_a_turn(len(bias), 1), law, bias, matrix, 0)
 
 

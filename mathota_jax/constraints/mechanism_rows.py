@@ -8,6 +8,7 @@ as if they were worlds), and the sweeps run over the small dense matrix of the r
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -133,9 +134,9 @@ def _closer_start(sweeps: int, laws: np.ndarray, law: Bounded, matrix: Array, er
 
     def left_to_do(impulses: Array) -> Array:
         """Energy (world,) of what one more update of each row alone would change."""
-        alone = _with_tree(matrix, law, impulses)
+        alone = with_tree(matrix, law, len(matrix))
         change = alone.update(impulses, errors + add_scaled(matrix, impulses)) - impulses
-        return safe_divide(change * change, alone.effective_mass).sum(0)
+        return safe_divide(change * change, jnp.broadcast_to(alone.effective_mass, change.shape)).sum(0)
 
     start = (impulses, jnp.zeros_like(impulses[0]))
     found, solved = lax.scan(solve_all, start, None, length=mechanism_drives.passes(laws))[0]
@@ -200,7 +201,7 @@ def _slot_count(joint_rows: Sequence[Rows]) -> int:
 
 def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Array) -> Array:
     """Impulses (row, world) after projected Gauss-Seidel sweeps over a dense matrix (row, row, world)."""
-    law = _with_tree(matrix, law, impulse)
+    law = jax.tree.map(lambda x: jnp.broadcast_to(x, impulse.shape), with_tree(matrix, law, len(matrix)))
 
     def turn(carry: tuple[Array, Array], row: tuple) -> tuple[tuple[Array, Array], None]:
         impulse, error = carry
@@ -214,10 +215,9 @@ def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Arra
     return lax.scan(sweep, (impulse, error), None, length=sweeps)[0][0]
 
 
-def _with_tree(matrix: Array, law: Bounded, like: Array) -> Bounded:
-    """The laws of rows (row, world) with the masses of all that hangs on them."""
+def with_tree(matrix: Array, law: Bounded, count: int) -> Bounded:
+    """The laws of the first rows (row, world), which are those of two bodies alone, with all that hangs on them."""
     works = law.effective_mass > 0
-    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(len(matrix)))
+    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(count))
     mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
-    law = Bounded(mass, law.softness, law.lower, law.upper)
-    return jax.tree.map(lambda x: jnp.broadcast_to(x, like.shape), law)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, mass.shape), dataclasses.replace(law, effective_mass=mass))
