@@ -26,6 +26,14 @@ def workshop(options=None, spheres=2):
     return builder.build(options or Options())
 
 
+def balls(count):
+    builder = SceneBuilder()
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True)
+    for k in range(count):
+        builder.add_body(Sphere(0.1), mass=1.0, position=(3.0 + k, 0.1, 0.0))
+    return builder.build()[0]
+
+
 def test_what_a_scene_has():
     found = lines(workshop()[0])
     assert found["bodies"] == "5 (4 moving, 1 static)"
@@ -52,8 +60,10 @@ def test_a_robot_on_the_ground():
     links = [builder.add_body(Sphere(0.1), mass=1.0, position=(0.3 * k, 0.1, 0)) for k in range(4)]
     for k in range(3):
         builder.add_joint(Hinge(links[k], links[k + 1], (0.3 * k + 0.15, 0.1, 0), (0, 0, 1)))
-    present = lines(builder.build()[0])["present"].split(", ")
+    found = lines(builder.build()[0])
+    present = found["present"].split(", ")
     assert "exact joints" in present and "contacts with the joints held" in present
+    assert found["expected cost"] == "not measured for these settings", "it would be wrong by an order of magnitude"
 
 
 def test_what_a_scene_lacks():
@@ -101,5 +111,5 @@ def test_expected_cost():
 
 
 def test_a_larger_scene_is_expected_to_cost_more():
-    few, many = (float(lines(workshop(spheres=count)[0])["expected cost"].split()[0]) for count in (1, 6))
+    few, many = (float(lines(balls(count))["expected cost"].split()[0]) for count in (1, 6))
     assert few < many

@@ -34,7 +34,13 @@ def recorded_motion(tmp_path, monkeypatch):
 
 def test_there_is_an_example_for_each_reader():
     assert len(blocks(ROOT / "README.md")) == 4
-    assert {page.stem for page in PAGES if blocks(page)} == {"environments", "gradients", "fitting", "batches"}
+    assert {page.stem for page in PAGES if blocks(page)} == {
+        "environments",
+        "gradients",
+        "fitting",
+        "batches",
+        "robots",
+    }
 
 
 @pytest.mark.parametrize("code", programs())
