@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, merge, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
@@ -207,9 +206,8 @@ def _solve_mechanisms(
     sweeps = scene.options.velocity_iterations
     joints, others = impulses[:joint_count], impulses[joint_count:]
     assert problem.joints is not None
-    laws = problem.joints.laws[np.asarray(bounded)]
     moved, change = mechanism_rows.solve(
-        responses, problem.joint_rows, bounded, laws, sweeps, velocity, joints, start[:joint_count]
+        responses, problem.joint_rows, bounded, problem.joints, sweeps, velocity, joints, start[:joint_count]
     )
     # What the joints take for it; the velocity is known better.
     joints = tuple(old + more for old, more in zip(joints, change, strict=True))
@@ -227,9 +225,9 @@ def _solve_reduced(
     """The same where contacts, too, act on mechanisms as wholes."""
     first = lax.stop_gradient(mechanism_contacts.to_reduced(scene, problem.joint_rows, begin.impulses))
     rates = reduced.rates(begin.with_joints)
-    if problem.joints is not None:
-        contacts = [group.rows for group in problem.contact_rows]
-        first = mechanism_start.closer_start(scene, problem.joints, contacts, reduced, rates, first)
+    assert problem.joints is not None
+    contacts = [group.rows for group in problem.contact_rows]
+    first = mechanism_start.closer_start(scene, problem.joints, contacts, reduced, rates, first)
     found = _sweep(scene, reduced.rows, rates, first, known=False)[1]
     impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, found)
     # What the joints take for it; the velocity is known better than their large impulses on light links would have it.

@@ -129,6 +129,17 @@ def in_order(impulses: Sequence[Array]) -> Array:
     return jnp.concatenate([jnp.moveaxis(part, 1, 2).reshape(-1, part.shape[-1]) for part in impulses])
 
 
+def by_group(groups: Sequence[Rows], values: Array) -> tuple[Array, ...]:
+    """The reverse: (turn, row, point, world) of each group."""
+    found, first = [], 0
+    for group in groups:
+        turns, rows, points = group.bias.shape[:3]
+        own = values[first : first + turns * rows * points].reshape(turns, points, rows, -1)
+        found.append(jnp.swapaxes(own, 1, 2))
+        first += turns * rows * points
+    return tuple(found)
+
+
 def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
     """The reverse; 0 for rows that always hold."""
     bounded = bounded_slots(scene)

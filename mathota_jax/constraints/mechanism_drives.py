@@ -9,8 +9,10 @@ over all of them that follow change nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -34,17 +36,42 @@ def are_stiff(laws: np.ndarray) -> bool:
     return bool(np.isin(laws, STIFF).any())
 
 
-def are_better(solved: Array, left_by_new: Array, left_by_old: Array) -> Array:
-    """Worlds to start from new impulses: where they solve all rows (1, else 0), or leave less to do than the old ones.
+def closer_start(
+    laws: np.ndarray,
+    law: Bounded,
+    matrix: Array,
+    errors: Array,
+    impulses: Array,
+    sweep: Callable[[Elimination, Array], Array],
+    left_to_do: Callable[[Array], Array],
+) -> Array:
+    """Impulses (row, world) from which to sweep over all rows.
 
-    They may not where servos meet their caps one after the other, or where a stop takes up what a stiff one would give.
+    They solve all rows, but where servos meet their caps one after the other, or where a stop takes up what a stiff spring
+    would give: there the better of these and the old ones are taken.
+
+    Args:
+      laws: static names of the laws of the first rows, which are scalar; some are stiff.
+      law: their coefficients (row, world).
+      matrix: (row, row, world) of all rows.
+      errors: (row, world) rates without impulses, of scalar rows with their biases.
+      impulses: (row, world) of the last step; what was at its bound is taken to stay there at first.
+      sweep: gives the impulses of the rows that an elimination leaves, from some to start from.
+      left_to_do: energy (world,) of what one more update of each row alone would change.
     """
-    return settle(jnp.where(left_by_new < left_by_old, 1.0, solved)) > 0.5
+    worlds = max(leaf.shape[-1] for leaf in (matrix, errors, impulses, *jax.tree.leaves(law)))
+    law, matrix, errors, impulses = in_every_world((law, matrix, errors, impulses), worlds)
 
+    def solve_all(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        found = _eliminate(laws, law, matrix, errors, before[0])
+        others = take(impulses, found.left)
+        return found.impulses(before[0], sweep(found, others) if len(found.left) else others), None
 
-def passes(laws: np.ndarray) -> int:
-    """How often to solve: a servo that meets its bound does not carry what the others were told that it would."""
-    return 2 if SERVO in laws else 1
+    # A servo that meets its bound does not carry what the others were told that it would.
+    passes = 2 if SERVO in laws else 1
+    new, solved = lax.scan(solve_all, (impulses, jnp.zeros_like(impulses[0])), None, length=passes)[0]
+    left, left_before, solved = lax.stop_gradient((left_to_do(new), left_to_do(impulses), solved))
+    return jnp.where(settle(jnp.where(left < left_before, 1.0, solved)) > 0.5, new, impulses)
 
 
 class Elimination(NamedTuple):
@@ -57,7 +84,7 @@ class Elimination(NamedTuple):
       alone: (row, world) impulses of the eliminated rows without the others.
       by_left: (row, row, world) what a unit impulse of one of the others (second) takes from them.
       free: (row, world) 0 for eliminated rows that stay at a bound, 1 for those that do not.
-      law: of the rows that may be eliminated and those among the others that are scalar, in order.
+      bounds: (row, world) lower and upper ones of the eliminated rows.
     """
 
     soft: np.ndarray
@@ -67,47 +94,38 @@ class Elimination(NamedTuple):
     alone: Array
     by_left: Array
     free: Array
-    law: Bounded
+    bounds: tuple[Array, Array]
 
     def impulses(self, old: Array, of_left: Array) -> tuple[Array, Array]:
-        """All scalar rows (row, world), in order, from `old` ones and those of the rows that are left (row, world).
+        """All rows (row, world), from `old` ones and those of the rows that are left (row, world).
 
         Also where (world,) no bound is met that was not met before, so that these solve all rows.
         """
         pushes = self.alone - add_scaled(self.by_left, of_left) if len(self.left) else self.alone
-        lower, upper = take((self.law.lower, self.law.upper), self.soft)
+        lower, upper = self.bounds
         met = settle(jnp.where((pushes < lower) | (pushes > upper), self.free, 0.0))
         pushes = jnp.where(self.free > 0.5, jnp.clip(pushes, lower, upper), take(old, self.soft))
-        scalar = self.left[: len(old) - len(self.soft)]
-        place = np.argsort(np.concatenate([self.soft, scalar]))
-        return take(jnp.concatenate([pushes, of_left[: len(scalar)]]), place), 1.0 - met.max(0)
+        place = np.argsort(np.concatenate([self.soft, self.left]))
+        return take(jnp.concatenate([pushes, of_left]), place), 1.0 - met.max(0)
 
 
-def eliminate(laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, old: Array) -> Elimination:
-    """Eliminates springs, dampers and servos, of which there are some.
-
-    Args:
-      laws: static names of the laws of the first rows, which are scalar.
-      law: their coefficients (row, world).
-      matrix: (row, row, world) of all rows.
-      errors: (row, world) rates without impulses, of scalar rows with their biases.
-      old: (row, world) impulses of the scalar rows so far; what is at its bound is taken to stay there.
-    """
-    worlds = max(leaf.shape[-1] for leaf in (matrix, errors, old, law.softness, law.effective_mass))
-    law, matrix, errors, old = in_every_world((law, matrix, errors, old), worlds)
+def _eliminate(laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, old: Array) -> Elimination:
+    """Eliminates springs, dampers and servos; arguments as for `closer_start`, what is at its bound in `old` stays there."""
     linear = np.isin(laws, LINEAR)
     soft, left = np.flatnonzero(linear), np.concatenate([np.flatnonzero(~linear), np.arange(len(laws), len(matrix))])
-    inside = (law.effective_mass > 0) & (old < law.upper) & (old > law.lower)
-    free = take(settle(jnp.where(inside, 1.0, 0.0).astype(errors.dtype)), soft)
+    law, pushes = take((law, old), soft)
+    bounds = law.lower, law.upper
+    inside = (law.effective_mass > 0) & (pushes < law.upper) & (pushes > law.lower)
+    free = settle(jnp.where(inside, 1.0, 0.0).astype(errors.dtype))
     rows = take(matrix, soft)
-    errors = errors + add_scaled(take(matrix, soft, axis=1), take(old, soft) * (1.0 - free))
+    errors = errors + add_scaled(take(matrix, soft, axis=1), pushes * (1.0 - free))
     unit = jnp.eye(len(soft), dtype=matrix.dtype)[..., None]
-    system = take(rows, soft, axis=1) * free * free[:, None] + unit * (take(law.softness, soft) * free + 1.0 - free)
+    system = take(rows, soft, axis=1) * free * free[:, None] + unit * (law.softness * free + 1.0 - free)
     given = jnp.concatenate([take(rows, left, axis=1), take(errors, soft)[:, None]], axis=1) * free[:, None]
     answers = dense.solve(system[None], given[None])[0]
     by_left, alone = answers[:, :-1], -answers[:, -1]
     if not len(left):
-        return Elimination(soft, left, matrix[:0, :0], errors[:0], alone, by_left, free, law)
+        return Elimination(soft, left, matrix[:0, :0], errors[:0], alone, by_left, free, bounds)
     across = take(take(matrix, left), soft, axis=1)
 
     def without(kept: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
@@ -115,4 +133,4 @@ def eliminate(laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, old:
         return kept - column[:, None] * answer, None
 
     kept = lax.scan(without, take(take(matrix, left), left, axis=1), (jnp.swapaxes(across, 0, 1), by_left))[0]
-    return Elimination(soft, left, kept, take(errors, left) + add_scaled(across, alone), alone, by_left, free, law)
+    return Elimination(soft, left, kept, take(errors, left) + add_scaled(across, alone), alone, by_left, free, bounds)

@@ -78,7 +78,7 @@ def solve(
     responses: Responses,
     joint_rows: Sequence[Rows],
     slots: tuple[int, ...],
-    laws: np.ndarray,
+    joints: JointRows,
     sweeps: int,
     velocity: Array,
     impulses: tuple[Array, ...],
@@ -90,7 +90,7 @@ def solve(
       responses: to these rows.
       joint_rows: all joint rows.
       slots: of the rows to solve.
-      laws: static names of the laws of these.
+      joints: all joint rows, of which the laws matter.
       sweeps: over these rows.
       velocity: (component, block, world) with `impulses`, along which the joints hold.
       impulses: of the joint groups.
@@ -103,8 +103,10 @@ def solve(
     law = jax.tree.map(lambda *parts: of_slots(joint_rows, slots, parts), *(group.law for group in joint_rows))
     error = of_slots(joint_rows, slots, [group.bias + row_velocity(group, velocity) for group in joint_rows])
     old, first = (of_slots(joint_rows, slots, values) for values in (impulses, start))
-    without = error - add_scaled(responses.matrix, old)
-    first = _closer_start(sweeps, laws, law, responses.matrix, without, first)
+    laws = joints.laws[np.asarray(slots)]
+    if mechanism_drives.are_stiff(laws):
+        without = error - add_scaled(responses.matrix, old)
+        first = _closer_start(sweeps, laws, law, responses.matrix, without, first)
     ahead = first - old
     error = error + add_scaled(responses.matrix, ahead)
     new = _sweep(sweeps, responses.matrix, law, *jnp.broadcast_arrays(first, error))
@@ -118,30 +120,17 @@ def _closer_start(sweeps: int, laws: np.ndarray, law: Bounded, matrix: Array, er
 
     Differentiable: where they solve the rows, few sweeps would not find the derivative either.
     """
-    if not mechanism_drives.are_stiff(laws):
-        return impulses
+    alone = with_tree(matrix, law, len(matrix))
 
-    impulses = jnp.broadcast_arrays(impulses, errors)[0]
-
-    def solve_all(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        pushes = before[0]
-        found = mechanism_drives.eliminate(laws, law, matrix, errors, pushes)
-        swept = take(impulses, found.left)
-        if len(found.left):
-            start = found.errors + add_scaled(found.matrix, swept)
-            swept = _sweep(sweeps, found.matrix, take(law, found.left), swept, start)
-        return found.impulses(pushes, swept), None
+    def sweep(found: mechanism_drives.Elimination, start: Array) -> Array:
+        error = found.errors + add_scaled(found.matrix, start)
+        return _sweep(sweeps, found.matrix, take(law, found.left), start, error)
 
     def left_to_do(impulses: Array) -> Array:
-        """Energy (world,) of what one more update of each row alone would change."""
-        alone = with_tree(matrix, law, len(matrix))
         change = alone.update(impulses, errors + add_scaled(matrix, impulses)) - impulses
         return safe_divide(change * change, jnp.broadcast_to(alone.effective_mass, change.shape)).sum(0)
 
-    start = (impulses, jnp.zeros_like(impulses[0]))
-    found, solved = lax.scan(solve_all, start, None, length=mechanism_drives.passes(laws))[0]
-    better = mechanism_drives.are_better(*lax.stop_gradient((solved, left_to_do(found), left_to_do(impulses))))
-    return jnp.where(better, found, impulses)
+    return mechanism_drives.closer_start(laws, law, matrix, errors, impulses, sweep, left_to_do)
 
 
 def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:

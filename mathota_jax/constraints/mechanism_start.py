@@ -12,7 +12,7 @@ from jax import Array, lax
 
 from mathota_jax.constraints import mechanism_drives
 from mathota_jax.constraints.joint_rows import JointRows
-from mathota_jax.constraints.mechanism_contacts import Reduced, contact_groups, in_order, scalar_group
+from mathota_jax.constraints.mechanism_contacts import Reduced, by_group, contact_groups, in_order, scalar_group
 from mathota_jax.constraints.mechanism_layout import bounded_slots
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
@@ -49,41 +49,39 @@ def closer_start(
     law, bias = jax.tree.map(lambda x: x[:, 0, 0], (reduced.rows[0].law, reduced.rows[0].bias))
     worlds = max(bias.shape[-1], rates.shape[-1])
     errors = jnp.concatenate(in_every_world([rates[: len(bounded)] + bias, rates[len(bounded) :]], worlds))
-    impulses = in_every_world(impulses, worlds)
 
-    def solve_all(_: Array, before: tuple[tuple[Array, ...], Array]) -> tuple[tuple[Array, ...], Array]:
-        (old, *begin), pushes = impulses, before[0][0][:, 0, 0]
-        found = mechanism_drives.eliminate(laws, law, reduced.matrix, errors, pushes)
+    def sweep(found: mechanism_drives.Elimination, start: Array) -> Array:
         scalar = found.left[found.left < len(bounded)]
         groups = contact_groups(contacts, found.matrix, len(scalar))
         if len(scalar):
             # Their errors have their biases already.
             groups.insert(0, scalar_group(take(law, scalar), jnp.zeros_like(take(bias, scalar)), found.matrix))
-            begin.insert(0, take(old, scalar))
         sweeps = scene.options.velocity_iterations
-        swept = pgs.solve(sweeps, 1, tuple(groups), found.errors[:, None], tuple(begin))[1]
-        pushes, solved = found.impulses(pushes, in_order(swept))
-        return (pushes[:, None, None], *swept[bool(len(scalar)) :]), solved
+        return in_order(pgs.solve(sweeps, 1, tuple(groups), found.errors[:, None], by_group(groups, start))[1])
 
-    start = (impulses, jnp.zeros_like(errors[0]))
-    found, solved = lax.fori_loop(0, mechanism_drives.passes(laws), solve_all, start)
-    left = [_left_to_do(reduced, rates, values) for values in (found, impulses)]
-    return jax.tree.map(functools.partial(jnp.where, mechanism_drives.are_better(solved, *left)), found, impulses)
+    found = mechanism_drives.closer_start(
+        laws,
+        law,
+        reduced.matrix,
+        errors,
+        in_order(in_every_world(impulses, worlds)),
+        sweep,
+        functools.partial(_left_to_do, reduced, rates),
+    )
+    return by_group(reduced.rows, found)
 
 
-def _left_to_do(reduced: Reduced, rates: Array, impulses: Sequence[Array]) -> Array:
-    """Energy (world,) of what one more update of each row alone would change; `rates` (row, world) without impulses."""
-    rates = rates + add_scaled(reduced.matrix, in_order(impulses))
-    total, first = jnp.zeros(rates.shape[-1], rates.dtype), 0
-    for group, impulse in zip(reduced.rows, impulses, strict=True):
-        turns, rows, points, worlds = impulse.shape
-        own = rates[first : first + turns * rows * points].reshape(turns, points, rows, worlds)
-        change = group.law.update(impulse, group.bias + jnp.swapaxes(own, 1, 2)) - impulse
+def _left_to_do(reduced: Reduced, rates: Array, impulses: Array) -> Array:
+    """Energy (world,) of what one more update of each row alone would change; (row, world), rates without impulses."""
+    rates = rates + add_scaled(reduced.matrix, impulses)
+    total = jnp.zeros(rates.shape[-1], rates.dtype)
+    groups = (reduced.rows, by_group(reduced.rows, rates), by_group(reduced.rows, impulses))
+    for group, rate, impulse in zip(*groups, strict=True):
+        change = group.law.update(impulse, group.bias + rate) - impulse
         if isinstance(group.law, Cone):
             normal, tangent = group.law.normal_mass, group.law.tangent_mass
             mass = jnp.stack([normal, tangent, tangent], axis=1)
         else:
             mass = group.law.effective_mass
         total = total + safe_divide(change * change, jnp.broadcast_to(mass, change.shape)).sum((0, 1, 2))
-        first += turns * rows * points
     return total
