@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, contacts, step
+from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Sphere, contacts, step
 
 GRAVITY = 9.81
 DOWN = (0.0, -GRAVITY, 0.0)
@@ -139,6 +139,41 @@ def box_stack(count: int = 10, half: float = 0.1, options: Options | None = None
 
 
 # Truths --------------------------------------------------------------------------------------------------------------
+
+
+def quadruped(drive: str, options: Options, ignores_itself: bool = True) -> tuple[Any, Any]:
+    """A torso of 20 kg on four legs of 0.6 kg; for `drive` see `add_driven_hinge`."""
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=1.0)
+    links = [builder.add_body(Box((0.2, 0.05, 0.2)), mass=20.0, position=(0, 0.55, 0))]
+    for x in (-0.2, 0.2):
+        for z in (-0.2, 0.2):
+            upper = builder.add_body(Capsule(0.02, 0.1), mass=0.5, position=(x, 0.385, z))
+            lower = builder.add_body(Capsule(0.02, 0.115), mass=0.1, position=(x, 0.135, z))
+            for parent, child, height in ((links[0], upper, 0.5), (upper, lower, 0.27)):
+                add_driven_hinge(builder, drive, parent, child, (x, height, z))
+            links += [upper, lower]
+    if ignores_itself:
+        builder.ignore_collisions(links)
+    return builder.build(options)
+
+
+def add_driven_hinge(builder: SceneBuilder, drive: str, parent: int, child: int, anchor: Any) -> None:
+    """A hinge about z with a "spring" or a "servo" of 1 N m/rad and 1 N m s/rad."""
+    gains = {"stiffness": 1.0, "damping": 1.0}
+    hinge = Hinge(parent=parent, child=child, anchor=anchor, axis=(0, 0, 1), **(gains if drive == "spring" else {}))
+    handle = builder.add_joint(hinge)
+    if drive == "servo":
+        builder.add_motor(handle, kind="position", limit=10.0, **gains)
+
+
+def stiffened(model: Any, drive: str, stiffness: Any, damping: Any) -> Any:
+    """The model with all its springs or servos (`drive`) of this stiffness and damping."""
+    name = {"spring": "joint", "servo": "motor"}[drive]
+    values = {f"{name}_stiffness": stiffness, f"{name}_damping": damping}
+    return dataclasses.replace(
+        model, **{key: jnp.full_like(getattr(model, key), value) for key, value in values.items()}
+    )
 
 
 def rotation_matrix(quaternion: Any) -> np.ndarray:

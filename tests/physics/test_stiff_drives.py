@@ -1,7 +1,6 @@
 """Arms and robots whose springs and servos hold almost as joints do. Closed forms: statics, one rigid bar, small motion."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -24,34 +23,22 @@ from mathota_jax import (
     step,
 )
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.scenes import DOWN, GRAVITY, undamped
+from tests.scenes import DOWN, GRAVITY, add_driven_hinge, quadruped, stiffened, undamped
 
 LINKS, LENGTH = 6, 0.2
 CENTRES = LENGTH * (np.arange(LINKS) + 0.5)
 
 
-def arm(drive, dt, gravity=DOWN, **joint):
+def arm(drive, dt, gravity=DOWN):
     """Six bars of 1 kg in a row along x, hinged about z; the first to the ground."""
     builder = SceneBuilder(gravity=gravity)
     parent = builder.add_body(Box((0.1, 0.1, 0.1)), static=True, collides=False)
     for link in range(LINKS):
         place = (LENGTH * (link + 0.5), 0, 0)
         child = builder.add_body(Box((0.1, 0.02, 0.02)), mass=1.0, position=place, collides=False)
-        spring = {"stiffness": 1.0, "damping": 1.0} if drive == "spring" else {}
-        hinge = Hinge(parent=parent, child=child, anchor=(LENGTH * link, 0, 0), axis=(0, 0, 1), **spring, **joint)
-        handle = builder.add_joint(hinge)
-        if drive == "servo":
-            builder.add_motor(handle, kind="position", stiffness=1.0, damping=1.0, limit=10.0)
+        add_driven_hinge(builder, drive, parent, child, (LENGTH * link, 0, 0))
         parent = child
     return builder.build(undamped(dt=dt))
-
-
-def stiffened(model, drive, stiffness, damping):
-    name = {"spring": "joint", "servo": "motor"}[drive]
-    values = {f"{name}_stiffness": stiffness, f"{name}_damping": damping}
-    return dataclasses.replace(
-        model, **{key: jnp.full_like(getattr(model, key), value) for key, value in values.items()}
-    )
 
 
 def angles_at_rest(stiffness):
@@ -66,26 +53,20 @@ def angles_at_rest(stiffness):
     return fsolve(excess, np.zeros(LINKS), xtol=1e-13)
 
 
-@functools.cache
-def settle(precision, drive, dt):
-    """A function of stiffness: the joint angles and the largest speed after 3 s."""
-    model, state = arm(drive, dt)
-
-    @jax.jit
-    def run(stiffness):
-        final, _ = rollout(stiffened(model, drive, stiffness, 0.01 * stiffness), state, round(3 / dt))
-        return joint_position(model, final), jnp.abs(final.velocity).max()
-
-    return run
-
-
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
 @pytest.mark.parametrize("drive", ["servo", pytest.param("spring", marks=pytest.mark.slow)])
 def test_an_arm_bears_its_weight(precision, drive, dt, gate):
     """With ten sweeps the links moved by 46 m/s at 1/60 s and 1e4 N m/rad."""
+    model, state = arm(drive, dt)
+
+    @jax.jit
+    def settle(stiffness):
+        final, _ = rollout(stiffened(model, drive, stiffness, 0.01 * stiffness), state, round(3 / dt))
+        return joint_position(model, final), jnp.abs(final.velocity).max()
+
     for stiffness in (1e4, 1e5, 1e6):
-        angles, speed = settle(str(precision), drive, dt)(stiffness)
+        angles, speed = settle(stiffness)
         truth = angles_at_rest(stiffness)
         limit = {"float64": 1e-6, "float32": 1e-3}[str(precision)]
         gate(
@@ -189,31 +170,11 @@ def test_derivative_of_what_bears_the_arm(float64, mode, gate):
     gate("slopes / truth - 1", slope / truth - 1, 1e-5)
 
 
-def robot(drive, dt):
-    """A torso of 20 kg on four legs of 0.6 kg."""
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True, friction=1.0)
-    links = [builder.add_body(Box((0.2, 0.05, 0.2)), mass=20.0, position=(0, 0.55, 0))]
-    for x in (-0.2, 0.2):
-        for z in (-0.2, 0.2):
-            upper = builder.add_body(Capsule(0.02, 0.1), mass=0.5, position=(x, 0.385, z))
-            lower = builder.add_body(Capsule(0.02, 0.115), mass=0.1, position=(x, 0.135, z))
-            for parent, child, height in ((links[0], upper, 0.5), (upper, lower, 0.27)):
-                spring = {"stiffness": 1.0, "damping": 1.0} if drive == "spring" else {}
-                hinge = Hinge(parent=parent, child=child, anchor=(x, height, z), axis=(0, 0, 1), **spring)
-                handle = builder.add_joint(hinge)
-                if drive == "servo":
-                    builder.add_motor(handle, kind="position", stiffness=1.0, damping=1.0)
-            links += [upper, lower]
-    builder.ignore_collisions(links)
-    return builder.build(undamped(dt=dt))
-
-
 @pytest.mark.parametrize("drive", ["servo", pytest.param("spring", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_robot_on_stiff_legs_stands_still(precision, drive, gate):
     """Ten sweeps alone, and forty at 2000 N m/rad, made it shiver by 0.2 m/s at 1/60 s."""
-    model, state = robot(drive, 1 / 60)
+    model, state = quadruped(drive, undamped(dt=1 / 60))
 
     @jax.jit
     def run(stiffness):

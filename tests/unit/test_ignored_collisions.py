@@ -3,46 +3,42 @@
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Sphere, contact_forces, describe, rollout
+from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, contact_forces, describe, rollout
 from mathota_jax.collision.broadphase import BROADPHASES
 from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
-from tests.scenes import DOWN, GRAVITY, undamped
-
-UP = (0.0, 1.0, 0.0)
-QUARTER_TURN = (0.5**0.5, 0.0, 0.0, 0.5**0.5)
+from tests.scenes import DOWN, GRAVITY, quadruped, stiffened, undamped
 
 
-def columns_of_balls(count=2, height=3, broadphase="auto", **options):
-    """Balls in columns of three on a plane, each 0.3 m above the one below; their handles (column, level)."""
+def columns_of_balls(count=2, broadphase="auto"):
+    """Builder, handles (column, level) and options of balls in columns of three, each 0.3 m above the one below."""
     builder = SceneBuilder(gravity=DOWN)
-    plane = builder.add_body(Plane(UP), static=True, friction=0.0, name="ground")
-    balls = np.empty((count, height), int)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.0, name="ground")
+    balls = np.empty((count, 3), int)
     for column in range(count):
-        for level in range(height):
+        for level in range(3):
             place = (3.0 * column, 0.1 + 0.5 * level, 0.0)
             balls[column, level] = builder.add_body(Sphere(0.1), mass=1.0, position=place, friction=0.0)
-    return builder, plane, balls, undamped(dt=1 / 120, broadphase=broadphase, **options)
+    return builder, balls, undamped(dt=1 / 120, broadphase=broadphase)
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.parametrize("broadphase", slow_but(["none", "grid"], ["none", *BROADPHASES]))
 def test_bodies_fall_through_what_they_ignore(broadphase, precision, gate):
     """The middle ball of a column ignores those of the column; the plane stops it where it lies in the lowest."""
-    builder, _, balls, options = columns_of_balls(broadphase=broadphase)
+    builder, balls, options = columns_of_balls(broadphase=broadphase)
     builder.ignore_collisions(int(balls[0, 1]), balls[0])
     model, state = builder.build(options)
-    steps = 24
-    fallen = np.asarray(rollout(model, state, steps)[0].position, float)
+    places, steps = np.asarray(rollout(model, state, 240)[1].position, float), 24
     free = 0.6 - 0.5 * GRAVITY * (steps * options.dt) ** 2
-    gate("free fall [m]", fallen[balls[:, 1], 1] - free, {"float32": 1e-6, "float64": 1e-12}[str(precision)])
-    at_rest = np.asarray(rollout(model, state, 240)[0].position, float)
+    fallen = places[steps - 1, balls[:, 1], 1]
+    gate("free fall [m]", fallen - free, {"float32": 1e-6, "float64": 1e-12}[str(precision)])
     # In the first column the upper ball, too, comes to rest on the lowest: the middle one is no obstacle.
     expected = [[0.1, 0.1, 0.3], [0.1, 0.3, 0.5]]
-    gate("heights at rest [m]", at_rest[balls, 1] - np.array(expected), 2e-4)
+    gate("heights at rest [m]", places[-1, balls, 1] - np.array(expected), 2e-4)
 
 
 def test_no_two_of_one_set_collide(gate):
-    builder, _, balls, options = columns_of_balls()
+    builder, balls, options = columns_of_balls()
     builder.ignore_collisions(balls[0])
     model, state = builder.build(options)
     final = rollout(model, state, 240)[0]
@@ -53,7 +49,7 @@ def test_no_two_of_one_set_collide(gate):
 
 def test_what_is_ignored_is_absent():
     """Slots, broadphase and kinds of pairs are those of the pairs that are left (benchmark M3)."""
-    builder, _, balls, options = columns_of_balls(count=3)
+    builder, balls, options = columns_of_balls(count=3)
     assert builder.build(options)[0].scene.broadphase is not None
     for column in balls:
         builder.ignore_collisions(column)
@@ -87,7 +83,7 @@ def test_what_never_meets_may_be_ignored_at_no_change(float64, gate):
     """One huge filter equals none (benchmark M2); with a broadphase, since slots of their own are swept in another order."""
     finals = []
     for ignores in (False, True):
-        builder, _, balls, options = columns_of_balls(broadphase="all_pairs")
+        builder, balls, options = columns_of_balls(broadphase="all_pairs")
         if ignores:
             builder.ignore_collisions(balls[0], balls[1])
         finals.append(rollout(*builder.build(options), 60)[0])
@@ -97,23 +93,10 @@ def test_what_never_meets_may_be_ignored_at_no_change(float64, gate):
 
 def test_a_robot_that_ignores_itself_stands_on_light_feet(precision, gate):
     """Four legs of two capsules: with their own pairs left out, contacts are solved with the joints held."""
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane(UP), static=True, friction=1.0)
-    robot = [builder.add_body(Capsule(0.05, 0.2), mass=20.0, position=(0, 0.55, 0), orientation=QUARTER_TURN)]
-    for x in (-0.2, 0.2):
-        for z in (-0.2, 0.2):
-            upper = builder.add_body(Capsule(0.02, 0.1), mass=0.5, position=(x, 0.385, z))
-            lower = builder.add_body(Capsule(0.02, 0.115), mass=0.1, position=(x, 0.135, z))
-            for parent, child, height in ((robot[0], upper, 0.5), (upper, lower, 0.27)):
-                hinge = Hinge(
-                    parent=parent, child=child, anchor=(x, height, z), axis=(0, 0, 1), stiffness=2e3, damping=20.0
-                )
-                builder.add_joint(hinge)
-            robot += [upper, lower]
     options = undamped(dt=1 / 240)
-    crowded = builder.build(options)[0]
-    builder.ignore_collisions(robot)
-    model, state = builder.build(options)
+    crowded = quadruped("spring", options, ignores_itself=False)[0]
+    model, state = quadruped("spring", options)
+    model = stiffened(model, "spring", 2e3, 20.0)
     assert crowded.scene.broadphase is not None and model.scene.broadphase is None
     assert "contacts with the joints held" in describe(model).split("absent")[0]
     final = rollout(model, state, 240)[0]
