@@ -6,11 +6,6 @@ A test that starts to pass fails the suite (strict xfail), so that its entry is 
 from __future__ import annotations
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_mechanism_joints.py::test_derivatives_of_both_modes_agree": "not converged with the default 10 "
-    "sweeps; by the masses, through 20 steps with stops, friction and motors, the modes differ by 2.7e-3, gate 1e-9, from "
-    "the first step at a stop on, while the Jacobians of each step agree to 1e-12. By inference: friction at its cap and a "
-    "stop on one joint want the same rate, so that round-off decides which gives way, which makes a difference before the "
-    "sweeps converge",
     "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "

@@ -27,6 +27,7 @@ from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Table
+from mathota_jax.spatial.settle import store_cotangents
 from mathota_jax.spatial.vector import where
 
 
@@ -82,6 +83,7 @@ def _rows(
     # An error turned into velocity whips a chain that starts open, and feeds a loop that can not close without bound. The
     # position correction takes it back without energy.
     baumgarte = 0.0 if scene.options.position_iterations else scene.options.baumgarte
+    felt, error, rate, coefficients = store_cotangents((felt, error, rate, coefficients))
     columns = Columns(felt, error, rate, angular[:, None], coefficients, model.dt, baumgarte)
     found = {law: LAWS[law](columns) for law in sorted(set(laws.tolist()))}
 

@@ -67,10 +67,11 @@ def joint_rows(model: Model, bodies: Bodies) -> JointRows:
     rates: list[Array] = []
     counts: list[int] = []
     angular: list[bool] = []
+    motion = (bodies.velocity, bodies.angular_velocity)
     for group in joint_groups(model.scene):
         group_rows = rows_of(model, group, joint_frames(model, bodies, group.joints))
         parent_motion, child_motion = (
-            Side(*store_cotangents(take((bodies.velocity, bodies.angular_velocity), group.members(model.scene, side))))
+            Side(*store_cotangents(take(motion, group.members(model.scene, side)), for_one_reader=True))
             for side in ("parent", "child")
         )
         rates += [inner(row.parent, parent_motion) + inner(row.child, child_motion) for row in group_rows]

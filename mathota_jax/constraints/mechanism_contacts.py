@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import contact, mechanism, mechanism_links
+from mathota_jax.constraints import contact, mechanism_links, row_sides
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
 from mathota_jax.constraints.mechanism_layout import bounded_slots
-from mathota_jax.constraints.mechanism_rows import of_slots, to_tables, with_tree
+from mathota_jax.constraints.mechanism_rows import of_slots, respond, to_tables, with_tree
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Bounded, Cone
@@ -31,19 +31,10 @@ from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY, Table
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_scaled, add_slices, repeat_worlds, spread
+from mathota_jax.spatial.spread import add_scaled, add_slices
 
 LARGEST_STEP = 1.9
 """Bound of the eigenvalues of the matrix of a constraint times its steps; sweeps diverge at 2."""
-
-
-class _Sides(NamedTuple):
-    """Jacobian and response (component, row, world) of rows on one of their sides, and velocity blocks."""
-
-    jacobian: Array
-    response: Array
-    blocks: tuple[int, ...]
 
 
 class _Class(NamedTuple):
@@ -73,14 +64,14 @@ class Reduced(NamedTuple):
       rows: one group for the rows with bounds on joints, if there are any, then one for each class of each contact table.
     """
 
-    sides: tuple[_Sides, ...]
+    sides: tuple[row_sides.Sides, ...]
     velocity: Array
     matrix: Array
     rows: tuple[Rows, ...]
 
     def rates(self, velocity: Array) -> Array:
         """Rates (row, 1, world) of the velocities (component, block, world)."""
-        return _rates(self.sides, velocity[:, :, None])
+        return row_sides.rates(self.sides, velocity[:, :, None])
 
     def with_biases(self, contacts: Sequence[Rows]) -> Reduced:
         """The same with those of `contacts`."""
@@ -97,17 +88,8 @@ class Reduced(NamedTuple):
 def reduce(scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows], contacts: Sequence[Rows]) -> Reduced:
     """The rows of a scene whose mechanisms take contacts, from those that act on single bodies."""
     worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in (*joint_rows, *contacts))))
-    sides = _sides(scene, joint_rows, contacts, worlds)
-    count, block_count = len(sides[0].blocks), links.layout.block_count
-    force = _of_blocks([side.jacobian for side in sides], sides, block_count)
-    tiled = repeat_worlds(links, count, worlds)
-    velocity = mechanism.respond(tiled, force.reshape(*force.shape[:2], -1)).reshape(force.shape)
-    if len(links.layout.links) < block_count:
-        is_link = np.isin(np.arange(block_count), links.layout.blocks)[:, None, None]
-        velocity = jnp.where(is_link, velocity, _of_blocks([side.response for side in sides], sides, block_count))
-    velocity = compute_once(velocity, velocity)
-    matrix = _rates(sides, velocity)
-    matrix = compute_once(matrix, matrix)
+    sides = row_sides.sides((*joint_rows, *contacts), _places(scene, joint_rows, contacts), worlds)
+    velocity, matrix = respond(links, sides, worlds)
     bounded = bounded_slots(scene)
     rows, first = [], len(bounded)
     if bounded:
@@ -170,64 +152,16 @@ def change(velocity: Array, impulses: Sequence[Array]) -> Array:
     return add_scaled(velocity, in_order(impulses))
 
 
-def _sides(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows], worlds: int) -> tuple[_Sides, ...]:
-    """All rows that do not always hold."""
-    slots = np.concatenate([group.table.order for group in joint_rows])
-    place_of = {slot: place for place, slot in enumerate(slots.tolist())}
-    parts, first = [np.array([place_of[slot] for slot in bounded_slots(scene)], int)], len(slots)
+def _places(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows]) -> np.ndarray:
+    """Of all rows that do not always hold, see `row_sides.sides`."""
+    parts = [row_sides.places_of_slots(joint_rows, bounded_slots(scene))]
+    first = sum(group.table.order.size for group in joint_rows)
     for group in contacts:
         parts += [
             first + members.rows(group.table, group.bias.shape[1]).reshape(-1) for members in _classes(group.table)
         ]
         first += group.bias[..., 0].size
-    places = np.concatenate(parts)
-    found = []
-    for side in range(2):
-        parts = [_side(group, side, worlds) for group in (*joint_rows, *contacts)]
-        blocks = np.array([block for part in parts for block in part.blocks])
-        jacobian, response = (
-            take(jnp.concatenate(values, axis=1), places, axis=1)
-            for values in ([part.jacobian for part in parts], [part.response for part in parts])
-        )
-        found.append(_Sides(jacobian, response, tuple(blocks[places].tolist())))
-    return tuple(found)
-
-
-def _side(group: Rows, side: int, worlds: int) -> _Sides:
-    """The rows of a group, in the order turn, column, row; of a side that it does not have 0, past the last block."""
-    table, rows = group.table, group.bias.shape[1]
-    matrix = group.matrix.dense()
-    if side >= len(matrix.jacobian):
-        nothing = jnp.zeros((matrix.jacobian[0].shape[2], table.order.size * rows, worlds), matrix.like.dtype)
-        return _Sides(nothing, nothing, (table.block_count,) * (table.order.size * rows))
-
-    def flat(values: Array) -> Array:
-        ordered = values.transpose(2, 0, 3, 1, 4).reshape(values.shape[2], -1, values.shape[-1])
-        return jnp.broadcast_to(ordered, (*ordered.shape[:2], worlds))
-
-    blocks = tuple(block for turn in table.blocks[side] for block in turn for _ in range(rows))
-    return _Sides(flat(matrix.jacobian[side]), flat(matrix.response[side]), blocks)
-
-
-def _of_blocks(values: Sequence[Array], sides: Sequence[_Sides], block_count: int) -> Array:
-    """(component, block, row, world) from (component, row, world) of each side."""
-    numbers = np.arange(block_count)[:, None]
-    shape = (len(values[0]), block_count, *values[0].shape[1:])
-    parts = [
-        jnp.where((np.asarray(side.blocks) == numbers)[..., None], spread(part[:, None], shape), 0.0)
-        for part, side in zip(values, sides, strict=True)
-    ]
-    return functools.reduce(jnp.add, parts)
-
-
-def _rates(sides: Sequence[_Sides], velocity: Array) -> Array:
-    """(row, column, world) of the velocities (component, block, column, world)."""
-    found = []
-    for side in sides:
-        at = take(velocity, np.minimum(side.blocks, velocity.shape[1] - 1), axis=1)
-        shape = (*side.jacobian.shape[:2], *at.shape[2:])
-        found.append(add_slices(spread(side.jacobian[:, :, None], shape) * spread(at, shape), 0))
-    return functools.reduce(jnp.add, found)
+    return np.concatenate(parts)
 
 
 def _group(table: Table, law: Bounded | Cone, bias: Array, matrix: Array, first: int) -> Rows:

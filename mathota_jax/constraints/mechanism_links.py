@@ -75,6 +75,8 @@ def links(scene: Scene, joints: JointRows, position: Vec3, inertia: Inertia, yie
     offset = position - _of_parents(found, position)
     grounded = column([link.parent == tree.GROUND for link in found.links])
     offset = offset.map(lambda x: jnp.where(grounded, 0.0, x))
+    # Its derivative comes from all over a step, and would be computed again for what is padded to all bodies.
+    offset = store_cotangents(offset, for_one_reader=True)
     translations, rotations = compute_once(_basis(found, joints, position.x), position.x)
     fixed = lax.stop_gradient((translations, rotations, offset, inertia))
     duals, factors = _factorize(found, *fixed)

@@ -17,18 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import mechanism, mechanism_drives, mechanism_links
+from mathota_jax.constraints import mechanism, mechanism_drives, mechanism_links, row_sides
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
+from mathota_jax.solver import bounded_rows
 from mathota_jax.solver.laws import Bounded
-from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.solver.rows import Rows, add_changes, row_velocity
+from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_scaled, repeat_worlds
+from mathota_jax.spatial.spread import add_scaled, add_slices, repeat_worlds
 
 STIFF = 16
 """Multiples of the machine epsilon, relative to two bodies alone, of the least motion that a tree can be said to allow."""
@@ -38,10 +38,12 @@ class Responses(NamedTuple):
     """What rows with bounds do to the trees that they act on.
 
     Attributes:
+      sides: the rows on single bodies.
       velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
       matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
     """
 
+    sides: tuple[row_sides.Sides, ...]
     velocity: Array
     matrix: Array
 
@@ -54,23 +56,31 @@ def responses(links: mechanism_links.Links, joint_rows: Sequence[Rows], slots: t
       joint_rows: all joint rows; their laws do not matter.
       slots: of the rows.
     """
-    count, block_count = len(slots), links.layout.block_count
     worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in joint_rows)))
-    tiled, rows = repeat_worlds((links, tuple(joint_rows)), count, worlds)
-    units = jnp.repeat(jnp.eye(count, dtype=links.offset.x.dtype), worlds, axis=1)
-    impulse = jnp.zeros((6, block_count, count * worlds), units.dtype)
-    for group, unit in zip(rows, to_tables(rows, slots, units), strict=True):
-        impulse = add_changes(group, Dense((), group.jacobian), impulse, unit)
-    velocity = compute_once(mechanism.respond(tiled, impulse), impulse)
-    matrix = of_slots(rows, slots, [row_velocity(group, velocity) for group in rows])
-    shape = (count, worlds)
-    matrix = compute_once(matrix.reshape(count, *shape), matrix)
-    return Responses(velocity.reshape(*velocity.shape[:-1], *shape), matrix)
+    sides = row_sides.sides(joint_rows, row_sides.places_of_slots(joint_rows, slots), worlds)
+    return Responses(sides, *respond(links, sides, worlds))
+
+
+def respond(links: mechanism_links.Links, sides: tuple[row_sides.Sides, ...], worlds: int) -> tuple[Array, Array]:
+    """Velocity and matrix, as in `Responses`, of any rows; bodies that are not in mechanisms move alone."""
+    count, block_count = len(sides[0].blocks), links.layout.block_count
+    force = row_sides.of_blocks([side.jacobian for side in sides], sides, block_count)
+    force = compute_once(force, force)
+    tiled = repeat_worlds(links, count, worlds)
+    velocity = mechanism.respond(tiled, force.reshape(*force.shape[:2], -1)).reshape(force.shape)
+    if len(links.layout.links) < block_count:
+        is_link = np.isin(np.arange(block_count), links.layout.blocks)[:, None, None]
+        alone = row_sides.of_blocks([side.response for side in sides], sides, block_count)
+        velocity = jnp.where(is_link, velocity, alone)
+    velocity = compute_once(velocity, velocity)
+    matrix = row_sides.rates(sides, velocity)
+    return velocity, compute_once(matrix, matrix)
 
 
 def own_mass(matrix: Array, alone: Array, rows: Any) -> Array:
     """``J M^-1 J^T`` of `rows` with the tree; `alone`: with their two bodies, (row, world), which allow more motion."""
-    own = jnp.stack([matrix[row, row] for row in rows])
+    diagonal = np.eye(len(matrix), dtype=bool)[..., None]
+    own = take(add_slices(jnp.where(diagonal, matrix, 0.0), 1), np.asarray(rows))
     return jnp.maximum(own, STIFF * jnp.finfo(own.dtype).eps * alone)
 
 
@@ -98,33 +108,29 @@ def solve(
 
     Returns:
       Velocity (component, block, world), along which the joints hold, and for each joint group the change of the impulses
-      of these rows. Differentiable in both modes, through the sweeps.
+      of these rows. Differentiable in both modes, at the solution.
     """
     law = jax.tree.map(lambda *parts: of_slots(joint_rows, slots, parts), *(group.law for group in joint_rows))
-    error = of_slots(joint_rows, slots, [group.bias + row_velocity(group, velocity) for group in joint_rows])
+    bias = of_slots(joint_rows, slots, [group.bias for group in joint_rows])
+    error = bias + row_sides.rates(responses.sides, velocity[:, :, None])[:, 0]
     old, first = (of_slots(joint_rows, slots, values) for values in (impulses, start))
     laws = joints.laws[np.asarray(slots)]
     if mechanism_drives.are_stiff(laws):
         without = error - add_scaled(responses.matrix, old)
-        first = _closer_start(sweeps, laws, law, responses.matrix, without, first)
-    ahead = first - old
-    error = error + add_scaled(responses.matrix, ahead)
-    new = _sweep(sweeps, responses.matrix, law, *jnp.broadcast_arrays(first, error))
-    change = new - old
+        first = _closer_start(sweeps, laws, *lax.stop_gradient((law, responses.matrix, without, first)))
+    law = with_tree(responses.matrix, law, len(slots))
+    change = bounded_rows.solve(sweeps, responses.matrix, law, error, old, first) - old
     moved = velocity + add_scaled(responses.velocity, change)
     return moved, to_tables(joint_rows, slots, change)
 
 
 def _closer_start(sweeps: int, laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, impulses: Array) -> Array:
-    """Impulses (row, world) from which to sweep over all rows, see `mechanism_drives`; `errors` are without any.
-
-    Differentiable: where they solve the rows, few sweeps would not find the derivative either.
-    """
+    """Impulses (row, world) from which to sweep over all rows, see `mechanism_drives`; `errors` are without any."""
     alone = with_tree(matrix, law, len(matrix))
 
     def sweep(found: mechanism_drives.Elimination, start: Array) -> Array:
-        error = found.errors + add_scaled(found.matrix, start)
-        return _sweep(sweeps, found.matrix, take(law, found.left), start, error)
+        left = with_tree(found.matrix, take(law, found.left), len(found.left))
+        return bounded_rows.solve(sweeps, found.matrix, left, found.errors, jnp.zeros_like(start), start)
 
     def left_to_do(impulses: Array) -> Array:
         change = alone.update(impulses, errors + add_scaled(matrix, impulses)) - impulses
@@ -163,8 +169,8 @@ def leave_stops(
     nothing = jnp.zeros((len(stops), worlds), error.dtype)
     masses = [group.law.effective_mass for group in joint_rows if isinstance(group.law, Bounded)]
     alone = of_slots(joint_rows, tuple(np.asarray(slots)[stops]), masses)
-    law = Bounded(alone, nothing, nothing, nothing + jnp.inf)
-    pushes = _sweep(sweeps, matrix, law, nothing, jnp.broadcast_to(error, nothing.shape))
+    law = with_tree(matrix, Bounded(alone, nothing, nothing, nothing + jnp.inf), len(stops))
+    pushes = bounded_rows.solve(sweeps, matrix, law, error, nothing, nothing)
     return add_scaled(responses.velocity[:, :, stops], pushes)
 
 
@@ -186,22 +192,6 @@ def to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array)
 
 def _slot_count(joint_rows: Sequence[Rows]) -> int:
     return sum(int((group.table.order != EMPTY).sum()) for group in joint_rows)
-
-
-def _sweep(sweeps: int, matrix: Array, law: Bounded, impulse: Array, error: Array) -> Array:
-    """Impulses (row, world) after projected Gauss-Seidel sweeps over a dense matrix (row, row, world)."""
-    law = jax.tree.map(lambda x: jnp.broadcast_to(x, impulse.shape), with_tree(matrix, law, len(matrix)))
-
-    def turn(carry: tuple[Array, Array], row: tuple) -> tuple[tuple[Array, Array], None]:
-        impulse, error = carry
-        place, column, law = row
-        new = law.update(impulse[place], error[place])
-        return (impulse.at[place].set(new), error + column * (new - impulse[place])), None
-
-    def sweep(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        return lax.scan(turn, carry, (jnp.arange(len(matrix)), jnp.swapaxes(matrix, 0, 1), law))
-
-    return lax.scan(sweep, (impulse, error), None, length=sweeps)[0][0]
 
 
 def with_tree(matrix: Array, law: Bounded, count: int) -> Bounded:

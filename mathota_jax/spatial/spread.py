@@ -19,7 +19,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mathota_jax.spatial.indexing import unstack
-from mathota_jax.spatial.settle import store
+from mathota_jax.spatial.settle import store, store_cotangents
 
 FEW_SLICES = 64
 """Beyond, a loop of the library costs less than the code of as many terms takes to compile."""
@@ -49,7 +49,8 @@ def repeat_worlds(tree: Any, count: int, worlds: int) -> Any:
             return x
         return spread(x[..., None, :], (*x.shape[:-1], count, worlds)).reshape(*x.shape[:-1], count * worlds)
 
-    return jax.tree.map(repeat, tree)
+    # The sum over the copies would else compute the cotangent of each of them in a single kernel, world by world.
+    return store_cotangents(jax.tree.map(repeat, tree))
 
 
 def add_slices(array: Array, axis: int) -> Array:

@@ -69,15 +69,20 @@ def observe(model, state):
     }
 
 
-@functools.cache
-def recorded(precision):
+def all_arms():
+    """Hinges by name, actions, model and state."""
     builder = SceneBuilder(gravity=DOWN)
     post = builder.add_body(Sphere(0.02), static=True, collides=False)
     hinges, actions = {}, []
     for name, (axis, options, motor, rate) in ARMS.items():
         hinges[name] = welded_arm(builder, post, axis, options, motor and motor[0], rate)
         actions += [motor[1]] if motor else []
-    model, state = builder.build(undamped(dt=DT))
+    return hinges, actions, *builder.build(undamped(dt=DT))
+
+
+@functools.cache
+def recorded(precision):
+    hinges, actions, model, state = all_arms()
     _, record = record_worlds(repeat(model, 1), repeat(state, 1), STEPS, observe, jnp.asarray([actions]))
     return hinges, {name: np.asarray(values, float)[:, 0] for name, values in record.items()}
 
@@ -150,6 +155,40 @@ def test_stop_without_restitution(precision, gate):
     gate("angle at the end - stop [rad]", angle[-1] - 0.5, 1e-4)
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+def test_derivatives_by_what_acts_on_the_arms(float64, mode, gate):
+    """All stiffnesses, dampings, frictions and caps times a factor: of angles and rates after 0.6 s, by the factor.
+
+    What rubs before it turns back, at 0.4 s: friction reverses at the end of a step, whose number has no derivative.
+    """
+    hinges, actions, model, state = all_arms()
+    time, before_turning = 0.6, 0.4
+
+    def final(factor):
+        names = ("joint_stiffness", "joint_damping", "joint_friction", "motor_stiffness", "motor_damping", "motor_cap")
+        scaled = dataclasses.replace(model, **{name: factor * getattr(model, name) for name in names})
+        steps = round(time / DT)
+        last, path = rollout(scaled, state, jnp.broadcast_to(jnp.asarray(actions), (steps, len(actions))))
+        before = jax.tree.map(lambda x: x[round(before_turning / DT) - 1], path)
+        return joint_position(model, last), joint_velocity(model, last), joint_position(model, before)
+
+    by_factor = jax.jit(mode(final))(jnp.asarray(1.0))
+    phase = OMEGA * time
+    of_angle = {
+        "oscillator": np.sin(phase) * phase / 2,
+        "servo": 0.4 * np.sin(phase) * phase / 2,
+        "held by friction": 0.0,
+        "stopped": 0.0,
+    }
+    of_rate = {"viscous": -2 * time * np.exp(-2 * time), "braked": -0.8 * time, "driven": 0.5 * time}
+    phase = OMEGA * before_turning
+    earlier = {"rubbing": (1 - SLIP) * np.sin(phase) * phase / 2}
+    kinds = ("angle", "rate", "angle before it turns")
+    for truths, found, kind in zip((of_angle, of_rate, earlier), by_factor, kinds, strict=True):
+        for name, truth in truths.items():
+            gate(f"{kind}, {name}: derivative - truth", float(found[hinges[name]]) - truth, 2e-3)
+
+
 # Three hinges --------------------------------------------------------------------------------------------------------
 
 
@@ -208,7 +247,7 @@ def test_arm_of_springs_and_dampers_is_that_of_mujoco(float64, gate):
 
 @pytest.mark.slow
 def test_derivatives_of_both_modes_agree(float64, gate):
-    """By the masses, through stops, friction and motors at work."""
+    """By the masses, through stops, friction and motors at work: friction that holds and a stop may say the same."""
     model, state = arm(
         friction=0.2, limits=(-0.3, 0.3), motor={"kind": "velocity", "cap": 0.5}, options=undamped(dt=1 / 60)
     )
