@@ -23,7 +23,7 @@ from mathota_jax.constraints import (
     mechanism_correction,
     mechanism_links,
     mechanism_rows,
-    mechanism_start,
+    mechanism_sweeps,
     motor,
     rebound_limit,
 )
@@ -227,8 +227,7 @@ def _solve_reduced(
     rates = reduced.rates(begin.with_joints)
     assert problem.joints is not None
     contacts = [group.rows for group in problem.contact_rows]
-    first = mechanism_start.closer_start(scene, problem.joints, contacts, reduced, rates, first)
-    found = _sweep(scene, reduced.rows, rates, first, known=False)[1]
+    found = mechanism_sweeps.solve(scene, problem.joints, contacts, reduced, rates, first)
     impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, found)
     # What the joints take for it; the velocity is known better than their large impulses on light links would have it.
     moved = begin.with_joints + reduced.change(found)

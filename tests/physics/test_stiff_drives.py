@@ -170,6 +170,26 @@ def test_derivative_of_what_bears_the_arm(float64, mode, gate):
     gate("slopes / truth - 1", slope / truth - 1, 1e-5)
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+def test_derivative_of_a_crouch(float64, mode, gate):
+    """Of the height by the angle of the hips, from the kinematics of the legs. By sweeps alone it had the wrong sign."""
+    thigh, shin, angle = 0.23, 0.25, 0.5
+    model, state = quadruped("servo", undamped(dt=1 / 60))
+
+    def knee(hip):
+        return -(hip + jnp.arcsin(thigh * jnp.sin(hip) / shin))
+
+    def height(hip, stiffness):
+        targets = jnp.tile(jnp.stack([hip, knee(hip)]), (150, 4))
+        return rollout(stiffened(model, "servo", stiffness, 0.05 * stiffness), state, targets)[0].position[1, 1]
+
+    slope = jax.jit(mode(height))
+    below = np.arcsin(thigh * np.sin(angle) / shin)
+    truth = -thigh * (np.sin(angle) + np.tan(below) * np.cos(angle))
+    for stiffness, limit in ((2e3, 0.025), (1e4, 0.01)):
+        gate(f"slope at {stiffness:g} N m/rad / truth - 1", float(slope(angle, stiffness)) / truth - 1, limit)
+
+
 @pytest.mark.parametrize("drive", ["servo", pytest.param("spring", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_robot_on_stiff_legs_stands_still(precision, drive, gate):

@@ -1,0 +1,100 @@
+"""The derivative of solved impulses of a dense matrix of rows, by one dense system.
+
+At the solution ``x = U(x, A x + b)`` with the laws U of all rows, so ``(1 - K - H A) dx = dU`` with the Jacobians K and H of
+U by impulses and errors, and dU what U changes at fixed impulses. Redundant rows make the system singular, but consistent:
+proximal steps as in `solver.implicit`. Sweeps find dx slowly where stiff drives connect feet that stick: these pull against
+each other through the legs, which give way by next to nothing, and a derivative that has not converged creeps.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.scipy.linalg import lu_solve
+
+from mathota_jax.constraints.mechanism_contacts import by_group, in_order
+from mathota_jax.solver.implicit import jacobians_of
+from mathota_jax.solver.rows import Rows
+from mathota_jax.spatial.indexing import in_every_world
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_scaled
+
+DELTA = {"float32": 1e-4, "float64": 1e-6}
+"""Weight of the proximal term beside 1. Where redundant rows are not quite consistent, because the impulses are not quite
+solved, its inverse is what that grows by: with 1e-10 in float64 a slope was three times too large."""
+
+STEPS = 3
+"""Proximal steps. Each leaves the share delta / (delta + s) of the error along a mode of stiffness s."""
+
+
+@jax.custom_jvp
+def derive(rows: tuple[Rows, ...], matrix: Array, rates: Array, found: Array) -> Array:
+    """Impulses (row, world) that were `found`, with the derivative of the solution.
+
+    Args:
+      rows: groups of rows, of which laws and biases matter.
+      matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
+      rates: (row, world) without impulses.
+      found: (row, world), without derivative.
+    """
+    del rows, matrix, rates
+    return found
+
+
+@derive.defjvp
+def _derive_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+    rows, matrix, rates, _ = primals
+    d_rows, d_matrix, d_rates, _ = tangents
+    impulses = derive(*primals)
+
+    def update(laws: Any, biases: Any, matrix: Array, rates: Array) -> Array:
+        """What the laws make of the impulses."""
+        errors = by_group(rows, rates + add_scaled(matrix, impulses))
+        parts = zip(laws, by_group(rows, impulses), biases, errors, strict=True)
+        return in_order([law.update(impulse, bias + error) for law, impulse, bias, error in parts])
+
+    of_rows, d_of_rows = (
+        (tuple(group.law for group in groups), tuple(group.bias for group in groups)) for groups in (rows, d_rows)
+    )
+    change = jax.jvp(update, (*of_rows, matrix, rates), (*d_of_rows, d_matrix, d_rates))[1]
+    return impulses, _solve(_system(rows, matrix, rates, impulses), change)
+
+
+def _system(rows: tuple[Rows, ...], matrix: Array, rates: Array, impulses: Array) -> Array:
+    """``1 - K - H A``, (world, row, row)."""
+    matrix = in_every_world(matrix, impulses.shape[-1])
+    errors = by_group(rows, rates + add_scaled(matrix, impulses))
+    found, first = [], 0
+    for group, impulse, error in zip(rows, by_group(rows, impulses), errors, strict=True):
+        turns, size, points, worlds = impulse.shape
+        blocks, count = turns * points, turns * points * size
+        # (turn, row, row', point, world) to (point, row, row', world)
+        by_impulse, by_error = (
+            jnp.moveaxis(part, 3, 1).reshape(blocks, size, size, worlds)
+            for part in compute_once(jacobians_of(group.law, impulse, group.bias + error), impulse)
+        )
+        own = matrix[first : first + count].reshape(blocks, size, -1, worlds)
+        passed = functools.reduce(jnp.add, [by_error[:, :, k, None] * own[:, None, k] for k in range(size)])
+        unit = jnp.eye(size, dtype=own.dtype)[..., None] - by_impulse
+        diagonal = jnp.where(np.eye(blocks, dtype=bool)[:, None, :, None, None], unit[:, :, None], 0.0)
+        sides = ((0, 0), (first, len(matrix) - first - count), (0, 0))
+        found.append(jnp.pad(diagonal.reshape(count, count, worlds), sides) - passed.reshape(count, -1, worlds))
+        first += count
+    return jnp.moveaxis(jnp.concatenate(found), -1, 0)
+
+
+def _solve(system: Array, right: Array) -> Array:
+    """Solutions (row, world); linear in `right`."""
+    delta = DELTA[str(right.dtype)]
+    factors = lax.linalg.lu(system + delta * jnp.eye(system.shape[-1], dtype=system.dtype))[:2]
+    right = right.T
+    solve = jax.vmap(lambda lu, pivots, right: lu_solve((lu, pivots), right))
+    found = jnp.zeros_like(right)
+    for _ in range(STEPS):
+        found = solve(*factors, right + delta * found)
+    return found.T
