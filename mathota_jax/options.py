@@ -50,7 +50,8 @@ class Options:
         each moving shape and at least 100. Empty places cost memory traffic: 27 boxes in a bin, of whose pairs 30 are
         close, take 1.4 times as long with this room (216) as with room for 40.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for 1.5 times the solver's own where all
-        rows are contacts with friction, for which they are accelerated, and for twice as many elsewhere.
+        rows are contacts with friction, for which they are accelerated, and for twice as many elsewhere. What mechanisms
+        solve with their joints held takes its derivative from one dense system instead.
       solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
         together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
         solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm
