@@ -138,9 +138,6 @@ def box_stack(count: int = 10, half: float = 0.1, options: Options | None = None
     return builder.build(options or Options(dt=1 / 240))
 
 
-# Truths --------------------------------------------------------------------------------------------------------------
-
-
 def quadruped(drive: str, options: Options, ignores_itself: bool = True) -> tuple[Any, Any]:
     """A torso of 20 kg on four legs of 0.6 kg; for `drive` see `add_driven_hinge`."""
     builder = SceneBuilder(gravity=DOWN)
@@ -174,6 +171,9 @@ def stiffened(model: Any, drive: str, stiffness: Any, damping: Any) -> Any:
     return dataclasses.replace(
         model, **{key: jnp.full_like(getattr(model, key), value) for key, value in values.items()}
     )
+
+
+# Truths --------------------------------------------------------------------------------------------------------------
 
 
 def rotation_matrix(quaternion: Any) -> np.ndarray:

@@ -52,23 +52,25 @@ def _derive_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     d_rows, d_matrix, d_rates, _ = tangents
     impulses = derive(*primals)
 
-    def update(laws: Any, biases: Any, matrix: Array, rates: Array) -> Array:
+    def errors_of(matrix: Array, rates: Array) -> tuple[Array, ...]:
+        return by_group(rows, rates + add_scaled(matrix, impulses))
+
+    def update(laws: Any, biases: Any, errors: tuple[Array, ...]) -> Array:
         """What the laws make of the impulses."""
-        errors = by_group(rows, rates + add_scaled(matrix, impulses))
         parts = zip(laws, by_group(rows, impulses), biases, errors, strict=True)
         return in_order([law.update(impulse, bias + error) for law, impulse, bias, error in parts])
 
     of_rows, d_of_rows = (
         (tuple(group.law for group in groups), tuple(group.bias for group in groups)) for groups in (rows, d_rows)
     )
-    change = jax.jvp(update, (*of_rows, matrix, rates), (*d_of_rows, d_matrix, d_rates))[1]
-    return impulses, _solve(_system(rows, matrix, rates, impulses), change)
+    errors, d_errors = jax.jvp(errors_of, (matrix, rates), (d_matrix, d_rates))
+    change = jax.jvp(update, (*of_rows, errors), (*d_of_rows, d_errors))[1]
+    return impulses, _solve(_system(rows, matrix, impulses, errors), change)
 
 
-def _system(rows: tuple[Rows, ...], matrix: Array, rates: Array, impulses: Array) -> Array:
+def _system(rows: tuple[Rows, ...], matrix: Array, impulses: Array, errors: tuple[Array, ...]) -> Array:
     """``1 - K - H A``, (world, row, row)."""
     matrix = in_every_world(matrix, impulses.shape[-1])
-    errors = by_group(rows, rates + add_scaled(matrix, impulses))
     found, first = [], 0
     for group, impulse, error in zip(rows, by_group(rows, impulses), errors, strict=True):
         turns, size, points, worlds = impulse.shape

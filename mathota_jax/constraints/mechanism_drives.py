@@ -45,7 +45,7 @@ def closer_start(
     sweep: Callable[[Elimination, Array], Array],
     left_to_do: Callable[[Array], Array],
 ) -> Array:
-    """Impulses (row, world) from which to sweep over all rows.
+    """Impulses (row, world) from which to sweep over all rows, of arguments without derivative.
 
     They solve all rows, but where servos meet their caps one after the other, or where a stop takes up what a stiff spring
     would give: there the better of these and the old ones are taken.
@@ -70,7 +70,7 @@ def closer_start(
     # A servo that meets its bound does not carry what the others were told that it would.
     passes = 2 if SERVO in laws else 1
     new, solved = lax.scan(solve_all, (impulses, jnp.zeros_like(impulses[0])), None, length=passes)[0]
-    left, left_before, solved = lax.stop_gradient((left_to_do(new), left_to_do(impulses), solved))
+    left, left_before = left_to_do(new), left_to_do(impulses)
     return jnp.where(settle(jnp.where(left < left_before, 1.0, solved)) > 0.5, new, impulses)
 
 

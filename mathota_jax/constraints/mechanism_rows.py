@@ -28,7 +28,7 @@ from mathota_jax.solver.table import EMPTY
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_scaled, add_slices, repeat_worlds
+from mathota_jax.spatial.spread import add_scaled, diagonal, repeat_worlds
 
 STIFF = 16
 """Multiples of the machine epsilon, relative to two bodies alone, of the least motion that a tree can be said to allow."""
@@ -79,8 +79,9 @@ def respond(links: mechanism_links.Links, sides: tuple[row_sides.Sides, ...], wo
 
 def own_mass(matrix: Array, alone: Array, rows: Any) -> Array:
     """``J M^-1 J^T`` of `rows` with the tree; `alone`: with their two bodies, (row, world), which allow more motion."""
-    diagonal = np.eye(len(matrix), dtype=bool)[..., None]
-    own = take(add_slices(jnp.where(diagonal, matrix, 0.0), 1), np.asarray(rows))
+    rows = np.asarray(rows)
+    first = rows.max() + 1
+    own = take(diagonal(matrix[:first, :first]), rows)
     return jnp.maximum(own, STIFF * jnp.finfo(own.dtype).eps * alone)
 
 

@@ -17,7 +17,7 @@ from jax import Array, lax
 from mathota_jax.solver.laws import Bounded
 from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.spread import add_scaled
+from mathota_jax.spatial.spread import add_scaled, diagonal
 
 REDUNDANT = 64
 """Multiples of the machine epsilon: what the rows before leave of the motion along a row that says the same, of its own."""
@@ -72,10 +72,8 @@ def _inverse_of_free(matrix: Array, softness: Array, free: Array) -> Array:
     By sweeps of J. H. Goodnight, "A tutorial on the SWEEP operator", 1979, which leave out what is redundant.
     """
     numbers = jnp.arange(len(matrix))
-    diagonal = (numbers[:, None] == numbers)[..., None]
-    matrix = matrix + jnp.where(diagonal, softness, 0.0)
-    own = jnp.where(diagonal, matrix, 0.0).sum(0)
-    least = REDUNDANT * jnp.finfo(matrix.dtype).eps * own
+    matrix = matrix + jnp.where((numbers[:, None] == numbers)[..., None], softness, 0.0)
+    least = REDUNDANT * jnp.finfo(matrix.dtype).eps * diagonal(matrix)
 
     def sweep(carry: tuple[Array, Array], row: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
         matrix, used = carry
