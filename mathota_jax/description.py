@@ -10,7 +10,7 @@ from mathota_jax import measured
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
-from mathota_jax.constraints.mechanism_layout import bounded_slots, layout, takes_contacts
+from mathota_jax.constraints.mechanism_layout import bounded_slots, layout, takes_contacts, touching_capacity
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -78,9 +78,12 @@ def _rows(scene: Scene) -> list[str]:
     turns = sum(table.turn_count for table in tables)
     most = sum(tier.turn_count for group in scene.compact_groups for tier in group.tiers)
     rows = scene.slot_count * (3 if scene.friction else 1)
+    touching = ""
+    if scene.broadphase is not None and takes_contacts(scene):
+        touching = f", those of up to {touching_capacity(scene)} close pairs at a time"
     return [
         f"contact slots: {scene.slot_count}",
-        f"rows: {rows} of contacts, {joint_row_count(scene)} of joints",
+        f"rows: {rows} of contacts{touching}, {joint_row_count(scene)} of joints",
         f"turns of a sweep: {turns}" + (f", and up to {most} of close pairs" if most else ""),
     ]
 

@@ -16,7 +16,7 @@ SOLVER_CHOICES = ("pgs", "converged", "soft_step")
 
 DEFAULT_SUBSTEPS = 4
 
-OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1), ("substeps", 1))
+OPTIONAL = (("gradient_iterations", 1), ("pair_capacity", 1), ("substeps", 1), ("touching_capacity", 1))
 """Integers that may be None, and their least value."""
 
 
@@ -49,6 +49,9 @@ class Options:
       pair_capacity: pairs that the broadphase can find in one step; None for all of up to 300 possible ones, else 8 for
         each moving shape and at least 100. Empty places cost memory traffic: 27 boxes in a bin, of whose pairs 30 are
         close, take 1.4 times as long with this room (216) as with room for 40.
+      touching_capacity: pairs of the broadphase that can touch at the same time where contacts are solved with the joints
+        held (see `exact_joints`); None for one for each moving shape and at least 8, as far as there is room. Each takes
+        a place in a dense matrix: what touches beyond them passes through (`Flag.CONTACT_OVERFLOW`).
       gradient_iterations: sweeps of the linear solver behind a derivative; None for 1.5 times the solver's own where all
         rows are contacts with friction, for which they are accelerated, and for twice as many elsewhere. What mechanisms
         solve with their joints held takes its derivative from one dense system instead.
@@ -67,12 +70,13 @@ class Options:
         restitution pass. All figures: docs/solvers.md.
       exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the end of
         the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot stands on feet
-        of any mass, where there are up to 192 rows of contacts, motors, friction and stops together, no broadphase, and no
-        other joints. Elsewhere three and more joints, or fewer where a scene has nothing else to solve ("soft_step": there
-        alone); one or two beside several contacts that bounce, and nets whose loops more than 96 rows close, are left to the
-        solver. Off: absent. Limits, motors, springs and friction on their joints are solved with all that hangs on them, by
-        `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred times as heavy as its first
-        link, a stop or a spring acts as it would on one rigid body. Springs and servos may be as stiff as they like.
+        of any mass, where there are up to 192 rows of contacts, motors, friction and stops together, those of the
+        broadphase with `touching_capacity` pairs, and no other joints. Elsewhere three and more joints, or fewer where a
+        scene has nothing else to solve ("soft_step": there alone); one or two beside several contacts that bounce, and
+        nets whose loops more than 96 rows close, are left to the solver. Off: absent. Limits, motors, springs and friction
+        on their joints are solved with all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an
+        arm whose end is a hundred times as heavy as its first link, a stop or a spring acts as it would on one rigid body.
+        Springs and servos may be as stiff as they like.
         Without it an error travels one joint a sweep: ten links at 1/240 s part by 5e-3 of a link and twenty at 1/60 s gain
         energy without bound; with it no gap is left but round-off. A step of ten links with "pgs" takes 1.2 times as long.
       substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.
@@ -113,6 +117,7 @@ class Options:
     warm_start_match: float = 0.02
     broadphase: str = "auto"
     pair_capacity: int | None = None
+    touching_capacity: int | None = None
     gradient_iterations: int | None = None
     solver: str = "pgs"
     exact_joints: bool = True

@@ -223,12 +223,12 @@ def _solve_reduced(
     begin: _Begin,
 ) -> tuple[Array, tuple[Array, ...]]:
     """The same where contacts, too, act on mechanisms as wholes."""
-    first = lax.stop_gradient(mechanism_contacts.to_reduced(scene, problem.joint_rows, begin.impulses))
+    first = lax.stop_gradient(mechanism_contacts.to_reduced(scene, problem.joint_rows, reduced, begin.impulses))
     rates = reduced.rates(begin.with_joints)
     assert problem.joints is not None
-    contacts = [group.rows for group in problem.contact_rows]
+    contacts = reduced.contacts([group.rows for group in problem.contact_rows])
     found = mechanism_sweeps.solve(scene, problem.joints, contacts, reduced, rates, first)
-    impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, found)
+    impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, reduced, found)
     # What the joints take for it; the velocity is known better than their large impulses on light links would have it.
     moved = begin.with_joints + reduced.change(found)
     pushed = add_impulses(problem.rows, begin.velocity, impulses)

@@ -21,8 +21,9 @@ class Flag(enum.IntFlag):
     """A position or velocity of this world became NaN or infinite, or an orientation lost its length."""
 
     CONTACT_OVERFLOW = 2
-    """More pairs were close to each other than `Options.pair_capacity`, or than fit around one body; the deepest were kept
-    as far as there was room, the others passed through each other in this step."""
+    """More pairs were close to each other than `Options.pair_capacity`, or than fit around one body, or touched than
+    `Options.touching_capacity`; the deepest were kept as far as there was room, the others passed through each other in
+    this step."""
 
     NOT_CONVERGED = 4
     """The search for the closest points of two shapes ended at its limit; the best bound that it found was used."""

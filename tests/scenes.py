@@ -138,10 +138,15 @@ def box_stack(count: int = 10, half: float = 0.1, options: Options | None = None
     return builder.build(options or Options(dt=1 / 240))
 
 
-def quadruped(drive: str, options: Options, ignores_itself: bool = True) -> tuple[Any, Any]:
-    """A torso of 20 kg on four legs of 0.6 kg; for `drive` see `add_driven_hinge`."""
+def quadruped(drive: str, options: Options, ignores_itself: bool = True, tiles: int = 0) -> tuple[Any, Any]:
+    """A torso of 20 kg on four legs of 0.6 kg, on a plane or on a row of tiles; for `drive` see `add_driven_hinge`."""
     builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True, friction=1.0)
+    if tiles:
+        for tile in range(tiles):
+            place = (0.5 * (tile - tiles // 2), -0.5, 0)
+            builder.add_body(Box((0.25, 0.5, 1.0)), static=True, position=place, friction=1.0)
+    else:
+        builder.add_body(Plane((0, 1, 0)), static=True, friction=1.0)
     links = [builder.add_body(Box((0.2, 0.05, 0.2)), mass=20.0, position=(0, 0.55, 0))]
     for x in (-0.2, 0.2):
         for z in (-0.2, 0.2):

@@ -20,15 +20,17 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.constraints import contact, mechanism_links, row_sides
+from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
-from mathota_jax.constraints.mechanism_layout import bounded_slots
+from mathota_jax.constraints.mechanism_layout import bounded_slots, touching_capacity
 from mathota_jax.constraints.mechanism_rows import of_slots, respond, to_tables, with_tree
+from mathota_jax.constraints.touching import Touching, touching
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Entries, Picked
 from mathota_jax.solver.rows import Rows
-from mathota_jax.solver.table import EMPTY, Table
+from mathota_jax.solver.table import EMPTY, Table, TracedTable
 from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.spread import add_scaled, add_slices
@@ -48,7 +50,7 @@ class _Class(NamedTuple):
     members: tuple[int, ...]
     points: int
 
-    def rows(self, table: Table, rows: int) -> np.ndarray:
+    def rows(self, table: Table | TracedTable, rows: int) -> np.ndarray:
         """(member, point, row) places among the rows of the table, in the order turn, column, row; `rows` are of a point."""
         columns = np.asarray(self.members)[:, None] * table.together + np.arange(self.points)
         return columns[..., None] * rows + np.arange(rows)
@@ -62,19 +64,28 @@ class Reduced(NamedTuple):
       velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
       matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
       rows: one group for the rows with bounds on joints, if there are any, then one for each class of each contact table.
+      close: the last of these, of contacts that the broadphase found, as they act on single bodies; None without one.
+      touching: which these are.
     """
 
-    sides: tuple[row_sides.Sides, ...]
+    sides: row_sides.RowSides
     velocity: Array
     matrix: Array
     rows: tuple[Rows, ...]
+    close: Rows | None = None
+    touching: Touching | None = None
 
     def rates(self, velocity: Array) -> Array:
         """Rates (row, 1, world) of the velocities (component, block, world)."""
-        return row_sides.rates(self.sides, velocity[:, :, None])
+        return self.sides.rates(velocity[:, :, None])
+
+    def contacts(self, groups: Sequence[Rows]) -> list[Rows]:
+        """Those of all contacts that have places here, with laws and biases of `groups`: laws of all contacts."""
+        return _with_places(groups, self.close, self.touching)
 
     def with_biases(self, contacts: Sequence[Rows]) -> Reduced:
         """The same with those of `contacts`."""
+        contacts = self.contacts(contacts)
         biases = _by_class([group.table for group in contacts], [group.bias for group in contacts])
         count = len(self.rows) - len(biases)
         groups = (dataclasses.replace(mine, bias=bias) for mine, bias in zip(self.rows[count:], biases, strict=True))
@@ -85,25 +96,46 @@ class Reduced(NamedTuple):
         return change(self.velocity, impulses)
 
 
-def reduce(scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows], contacts: Sequence[Rows]) -> Reduced:
+def reduce(
+    scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows], groups: Sequence[ContactRows]
+) -> Reduced:
     """The rows of a scene whose mechanisms take contacts, from those that act on single bodies."""
+    contacts = [group.rows for group in groups]
     worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in (*joint_rows, *contacts))))
-    sides = row_sides.sides((*joint_rows, *contacts), _places(scene, joint_rows, contacts), worlds)
+    traced = [group for group in groups if isinstance(group.rows.table, TracedTable)]
+    contacts, found = contacts[: len(contacts) - len(traced)], None
+    fixed = (*joint_rows, *contacts)
+    sides, close = row_sides.RowSides(row_sides.fixed_sides(fixed, _places(scene, joint_rows, contacts), worlds)), None
+    if traced:
+        found = touching(traced, touching_capacity(scene))
+        close = found.rows([group.rows for group in traced])
+        sides, contacts = sides._replace(traced=row_sides.traced_sides(close, worlds)), [*contacts, close]
     velocity, matrix = respond(links, sides, worlds)
     bounded = bounded_slots(scene)
     rows, first = [], len(bounded)
     if bounded:
         rows.append(_joint_group(joint_rows, bounded, matrix))
     rows += contact_groups(contacts, matrix, first)
-    return Reduced(sides, velocity, matrix, tuple(rows))
+    return Reduced(sides, velocity, matrix, tuple(rows), close, found)
 
 
-def to_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
+def _with_places(groups: Sequence[Rows], close: Rows | None, found: Touching | None) -> list[Rows]:
+    if close is None or found is None:
+        return [*groups]
+    count = len(groups) - len(found.tables)
+    return [*groups[:count], found.with_laws(close, groups[count:])]
+
+
+def to_reduced(
+    scene: Scene, joint_rows: Sequence[Rows], reduced: Reduced, values: Sequence[Array]
+) -> tuple[Array, ...]:
     """Values of all groups (turn, row, column, world), in the order of the reduced ones."""
     bounded = bounded_slots(scene)
     joints, contacts = values[: len(joint_rows)], values[len(joint_rows) :]
     found = [of_slots(joint_rows, bounded, joints)[:, None, None]] if bounded else []
-    return (*found, *_by_class(contact.contact_tables(scene), contacts))
+    tables = contact.contact_tables(scene)
+    found += _by_class(tables, contacts[: len(tables)])
+    return (*found, reduced.touching.of_tables(contacts[len(tables) :])) if reduced.touching else tuple(found)
 
 
 def in_order(impulses: Sequence[Array]) -> Array:
@@ -122,19 +154,25 @@ def by_group(groups: Sequence[Rows], values: Array) -> tuple[Array, ...]:
     return tuple(found)
 
 
-def from_reduced(scene: Scene, joint_rows: Sequence[Rows], values: Sequence[Array]) -> tuple[Array, ...]:
-    """The reverse; 0 for rows that always hold."""
+def from_reduced(
+    scene: Scene, joint_rows: Sequence[Rows], reduced: Reduced, values: Sequence[Array]
+) -> tuple[Array, ...]:
+    """The reverse; 0 for rows that always hold, and for contacts without a place."""
     bounded = bounded_slots(scene)
     worlds = max(value.shape[-1] for value in values)
     if bounded:
         joints = to_tables(joint_rows, bounded, values[0][:, 0, 0])
     else:
         joints = tuple(jnp.zeros((*group.bias.shape[:-1], worlds), group.bias.dtype) for group in joint_rows)
-    return (*joints, *_by_turn(contact.contact_tables(scene), values[bool(bounded) :]))
+    own, close = values[bool(bounded) :], []
+    if reduced.touching is not None:
+        own, close = own[:-1], reduced.touching.to_tables(own[-1])
+    return (*joints, *_by_turn(contact.contact_tables(scene), own), *close)
 
 
 def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows, ...], Array]:
     """Groups for the normals of the contacts alone, with the biases of `contacts`; the velocity under a unit impulse."""
+    contacts = reduced.contacts(contacts)
     groups = reduced.rows[len(reduced.rows) - sum(len(_classes(group.table)) for group in contacts) :]
     first = len(reduced.matrix) - sum(group.bias[..., 0].size for group in groups)
     numbers = []
@@ -265,13 +303,13 @@ def _convergent(own: Array, normal: Array, tangent: Array, active: Array) -> Arr
 
 
 @functools.cache
-def _classes(table: Table) -> tuple[_Class, ...]:
+def _classes(table: Table | TracedTable) -> tuple[_Class, ...]:
     """The constraints of a table by their number of points; padding is none."""
     points = (table.order.reshape(-1, table.together) != EMPTY).sum(1)
     return tuple(_Class(tuple(np.flatnonzero(points == n).tolist()), n) for n in sorted(set(points.tolist()) - {0}))
 
 
-def _of_class(table: Table, members: _Class, values: Array) -> Array:
+def _of_class(table: Table | TracedTable, members: _Class, values: Array) -> Array:
     """(member, row, point, world) from (turn, row, column, world)."""
     turns, rows, columns, worlds = values.shape
     split = values.reshape(turns, rows, columns // table.together, table.together, worlds)
@@ -279,7 +317,7 @@ def _of_class(table: Table, members: _Class, values: Array) -> Array:
     return take(of_all, members.members)[:, :, : members.points]
 
 
-def _by_class(tables: Sequence[Table], values: Sequence[Array]) -> list[Array]:
+def _by_class(tables: Sequence[Table | TracedTable], values: Sequence[Array]) -> list[Array]:
     """(member, row, point, world) of all classes from (turn, row, column, world) of the tables."""
     pairs = zip(tables, values, strict=True)
     return [_of_class(table, members, value) for table, value in pairs for members in _classes(table)]

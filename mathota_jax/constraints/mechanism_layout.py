@@ -24,6 +24,9 @@ MOST_ROWS = 192
 """Rows of contacts and with bounds of the largest scene in which they are solved with the joints held: the matrix grows with
 their square."""
 
+FEWEST_TOUCHING = 8
+"""Pairs of the broadphase that can touch at the same time where contacts are solved with the joints held, at least."""
+
 MOST_CLOSING = 96
 """Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
 
@@ -173,14 +176,57 @@ def _has_no_others(scene: Scene, found: Layout) -> bool:
 
 
 def _takes_contacts(scene: Scene, found: Layout) -> bool:
-    if scene.options.solver != "pgs" or scene.broadphase is not None or not scene.slot_count:
+    if scene.options.solver != "pgs" or not scene.slot_count:
         return False
-    bounded, tables = _bounded_slots(scene, found), contact_tables(scene)
-    if _row_count(found) + len(bounded) != joint_row_count(scene):
+    if _row_count(found) + len(_bounded_slots(scene, found)) != joint_row_count(scene):
         return False
-    on_links = any(set(found.blocks) & set(blocks) for table in tables for side in table.blocks for blocks in side)
-    points = sum(int((table.order != EMPTY).sum()) for table in tables)
-    return on_links and len(bounded) + points * (3 if scene.friction else 1) <= MOST_ROWS
+    if not _contacts_on_links(scene, found):
+        return False
+    room = (MOST_ROWS - _own_rows(scene, found)) // _rows_of_a_point(scene)
+    if scene.broadphase is None:
+        return room >= 0
+    fewest = min(scene.place_count, scene.options.touching_capacity or FEWEST_TOUCHING)
+    return room >= fewest * _most_points(scene)
+
+
+@functools.cache
+def touching_capacity(scene: Scene) -> int:
+    """Pairs of the broadphase that can touch at the same time, where mechanisms take contacts: one for each moving shape.
+
+    As far as there is room for them.
+    """
+    found = layout(scene)
+    assert found is not None
+    moving = sum(not scene.static[scene.shapes[entry].body] for entry in _close_shapes(scene))
+    wanted = scene.options.touching_capacity or max(FEWEST_TOUCHING, moving)
+    room = (MOST_ROWS - _own_rows(scene, found)) // (_rows_of_a_point(scene) * _most_points(scene))
+    return min(scene.place_count, wanted, room)
+
+
+def _own_rows(scene: Scene, found: Layout) -> int:
+    """Rows of joints with bounds, and of the pairs that have slots of their own."""
+    points = sum(int((table.order != EMPTY).sum()) for table in contact_tables(scene))
+    return len(_bounded_slots(scene, found)) + points * _rows_of_a_point(scene)
+
+
+def _rows_of_a_point(scene: Scene) -> int:
+    return 3 if scene.friction else 1
+
+
+def _most_points(scene: Scene) -> int:
+    """Points of a pair of the broadphase, at most."""
+    return max(group.point_count for group in scene.compact_groups)
+
+
+def _contacts_on_links(scene: Scene, found: Layout) -> bool:
+    links = {scene.dynamic_bodies[block] for block in found.blocks}
+    own = {body for group in scene.pair_groups for side in (group.bodies_a, group.bodies_b) for body in side}
+    return bool(links & (own | {scene.shapes[entry].body for entry in _close_shapes(scene)}))
+
+
+def _close_shapes(scene: Scene) -> tuple[int, ...]:
+    """Entries of the shapes whose pairs the broadphase finds."""
+    return () if scene.broadphase is None else scene.broadphase.shapes
 
 
 def _row_count(found: Layout) -> int:

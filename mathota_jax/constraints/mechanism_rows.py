@@ -43,7 +43,7 @@ class Responses(NamedTuple):
       matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
     """
 
-    sides: tuple[row_sides.Sides, ...]
+    sides: row_sides.RowSides
     velocity: Array
     matrix: Array
 
@@ -57,23 +57,23 @@ def responses(links: mechanism_links.Links, joint_rows: Sequence[Rows], slots: t
       slots: of the rows.
     """
     worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in joint_rows)))
-    sides = row_sides.sides(joint_rows, row_sides.places_of_slots(joint_rows, slots), worlds)
+    places = row_sides.places_of_slots(joint_rows, slots)
+    sides = row_sides.RowSides(row_sides.fixed_sides(joint_rows, places, worlds))
     return Responses(sides, *respond(links, sides, worlds))
 
 
-def respond(links: mechanism_links.Links, sides: tuple[row_sides.Sides, ...], worlds: int) -> tuple[Array, Array]:
+def respond(links: mechanism_links.Links, sides: row_sides.RowSides, worlds: int) -> tuple[Array, Array]:
     """Velocity and matrix, as in `Responses`, of any rows; bodies that are not in mechanisms move alone."""
-    count, block_count = len(sides[0].blocks), links.layout.block_count
-    force = row_sides.of_blocks([side.jacobian for side in sides], sides, block_count)
+    block_count = links.layout.block_count
+    force = sides.forces(block_count)
     force = compute_once(force, force)
-    tiled = repeat_worlds(links, count, worlds)
+    tiled = repeat_worlds(links, force.shape[2], worlds)
     velocity = mechanism.respond(tiled, force.reshape(*force.shape[:2], -1)).reshape(force.shape)
     if len(links.layout.links) < block_count:
         is_link = np.isin(np.arange(block_count), links.layout.blocks)[:, None, None]
-        alone = row_sides.of_blocks([side.response for side in sides], sides, block_count)
-        velocity = jnp.where(is_link, velocity, alone)
+        velocity = jnp.where(is_link, velocity, sides.alone(block_count))
     velocity = compute_once(velocity, velocity)
-    matrix = row_sides.rates(sides, velocity)
+    matrix = sides.matrix(velocity)
     return velocity, compute_once(matrix, matrix)
 
 
@@ -113,7 +113,7 @@ def solve(
     """
     law = jax.tree.map(lambda *parts: of_slots(joint_rows, slots, parts), *(group.law for group in joint_rows))
     bias = of_slots(joint_rows, slots, [group.bias for group in joint_rows])
-    error = bias + row_sides.rates(responses.sides, velocity[:, :, None])[:, 0]
+    error = bias + responses.sides.rates(velocity[:, :, None])[:, 0]
     old, first = (of_slots(joint_rows, slots, values) for values in (impulses, start))
     laws = joints.laws[np.asarray(slots)]
     if mechanism_drives.are_stiff(laws):

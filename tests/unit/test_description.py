@@ -4,7 +4,7 @@ import jax
 import pytest
 
 from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, describe
-from tests.scenes import sphere_on_plane, undamped, with_dt
+from tests.scenes import quadruped, sphere_on_plane, undamped, with_dt
 
 
 def lines(model):
@@ -86,6 +86,11 @@ def test_the_broadphase_and_its_capacities():
     found = lines(model)
     assert found["broadphase"] == "all_pairs of 6 shapes, up to 7 close pairs"
     assert any(name.startswith("close pairs, sphere-sphere with a moving body") for name in found)
+
+
+def test_pairs_that_touch_with_the_joints_held():
+    model, _ = quadruped("servo", Options(touching_capacity=5), ignores_itself=False)
+    assert lines(model)["rows"] == "276 of contacts, those of up to 5 close pairs at a time, 48 of joints"
 
 
 @pytest.mark.parametrize("options", [None, Options(sleep=True), Options(broadphase="all_pairs", sleep=True)])

@@ -19,6 +19,7 @@ DEFAULTS = {
     "warm_start": True,
     "broadphase": "auto",
     "pair_capacity": None,
+    "touching_capacity": None,
     "solver": "pgs",
     "exact_joints": True,
     "substeps": None,
@@ -50,7 +51,9 @@ def test_options_are_frozen_hashable_and_comparable():
         Options().dt = 0.1
 
 
-@pytest.mark.parametrize(("name", "value"), [("broadphase", "octree"), ("broadphase", None), ("pair_capacity", 0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("broadphase", "octree"), ("broadphase", None), ("pair_capacity", 0), ("touching_capacity", 0)]
+)
 def test_bad_broadphase_is_refused(name, value):
     with pytest.raises(ValueError, match=f"Options.{name}"):
         Options(**{name: value})
