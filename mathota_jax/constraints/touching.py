@@ -55,8 +55,8 @@ class Touching:
     def with_laws(self, rows: Rows, groups: Sequence[Rows]) -> Rows:
         """Rows in the places with the laws and biases of those of the tables; 0 where nothing touches."""
         bias = self.of_tables([group.bias for group in groups])
-        laws = [group.law for group in groups]
-        if not isinstance(laws[0], Cone):
+        laws = [group.law for group in groups if isinstance(group.law, Cone)]
+        if not laws:
             mass = self.of_tables([normal_mass(group) for group in groups])
             return dataclasses.replace(rows, bias=bias, law=push_only(mass))
         if any(law.first_grip is not None for law in laws):

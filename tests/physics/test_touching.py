@@ -52,10 +52,11 @@ def test_a_leg_carries_a_free_ball(precision, ground, gate):
 LENGTH = 0.4
 
 
-def test_derivatives_of_a_push(float64, gate):
+@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+def test_derivatives_of_a_push(float64, gate, mode):
     """A motor of torque T on an arm of inertia I pushes a ball of mass m a distance L away: ``v = T L t / (I + m L^2)``.
 
-    In both modes, by the torque, the ball's mass and the arm's.
+    By the torque, the ball's mass and the arm's.
     """
     builder = SceneBuilder(gravity=(0, 0, 0))
     post = builder.add_body(Sphere(0.05), static=True, position=(0, 0, 0), collides=False)
@@ -82,9 +83,7 @@ def test_derivatives_of_a_push(float64, gate):
         inertia = arm_mass * (LENGTH**2 / 3 + 0.02**2 / 3) + 0.01 * (LENGTH**2 + 0.4 * 0.05**2)
         return torque * LENGTH * (steps / 240) / (inertia + mass * LENGTH**2)
 
-    gate("speed / truth - 1", float(jax.jit(speed)(at)) / float(truth(at)) - 1, 1e-4)
-    for mode in (jax.jacfwd, jax.jacrev):
-        gate(f"{mode.__name__} / truth - 1", np.asarray(jax.jit(mode(speed))(at) / jax.grad(truth)(at)) - 1, 1e-4)
+    gate("derivatives / truth - 1", np.asarray(jax.jit(mode(speed))(at) / jax.grad(truth)(at)) - 1, 1e-4)
 
 
 @pytest.mark.slow
@@ -161,13 +160,14 @@ def test_contacts_beyond_the_capacity_set_a_flag(gate):
     """Three balls on a plate without friction, of which two find a place: the deepest ones. World by world."""
     builder = on_slab(0.0)
     (foot,) = leg(builder, (0.2,), foot=(0.4, 0.02, 0.1), friction=0.0)
-    plate = builder.add_body(Box((0.4, 0.02, 0.1)), mass=0.5, position=(0, 0.46, 0))
+    plate = builder.add_body(Box((0.4, 0.02, 0.1)), mass=0.5, position=(0, 0.46, 0), friction=0.0)
     builder.add_joint(Fixed(foot, plate, (0, 0.44, 0)))
-    balls = [builder.add_body(Sphere(0.1), mass=1.0, position=(x, 0.58, 0)) for x in (-0.3, 0.0, 0.3)]
+    balls = [builder.add_body(Sphere(0.1), mass=1.0, position=(x, 0.58, 0), friction=0.0) for x in (-0.3, 0.0, 0.3)]
     builder.ignore_collisions(plate, "slab")
+    builder.ignore_collisions(balls)
     model, state = builder.build(close(touching_capacity=3))
     assert takes_contacts(model) and not model.scene.friction
-    heights = jnp.asarray([[0.0, 0.0, 0.3], [-1e-4, 0.0, -1e-4], [0.3, 0.3, 0.3], [0.3, 0.0, 0.0]])
+    heights = jnp.asarray([[0.0, 0.0, 0.3], [-1e-4, 1e-5, -1e-4], [0.3, 0.3, 0.3], [0.3, 0.0, 0.0]])
     order = jnp.asarray([2, 0, 3, 1])
     lifted = jax.vmap(lambda h: dataclasses.replace(state, position=state.position.at[jnp.asarray(balls), 1].add(h)))
     run = jax.jit(jax.vmap(lambda state: step(model, state)))
