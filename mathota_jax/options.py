@@ -50,8 +50,9 @@ class Options:
         each moving shape and at least 100. Empty places cost memory traffic: 27 boxes in a bin, of whose pairs 30 are
         close, take 1.4 times as long with this room (216) as with room for 40.
       touching_capacity: pairs of the broadphase that can touch at the same time where contacts are solved with the joints
-        held (see `exact_joints`); None for one for each moving shape and at least 8, as far as there is room. Each takes
-        a place in a dense matrix: what touches beyond them passes through (`Flag.CONTACT_OVERFLOW`).
+        held (see `exact_joints`); None for one for each moving shape of a link, four for each other one, and at least 8.
+        Each takes a place in a dense matrix: what touches beyond them passes through (`Flag.CONTACT_OVERFLOW`). Where they
+        are too many for the matrix, fewer may be asked for.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for 1.5 times the solver's own where all
         rows are contacts with friction, for which they are accelerated, and for twice as many elsewhere. What mechanisms
         solve with their joints held takes its derivative from one dense system instead.

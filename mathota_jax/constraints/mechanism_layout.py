@@ -25,7 +25,11 @@ MOST_ROWS = 192
 their square."""
 
 FEWEST_TOUCHING = 8
-"""Pairs of the broadphase that can touch at the same time where contacts are solved with the joints held, at least."""
+"""Pairs of the broadphase that can touch at the same time where contacts are solved with the joints held, at least: one for
+each shape of a link, and more for free ones, which lie in heaps."""
+
+TOUCHING_A_FREE_SHAPE = 4
+"""Of those, for each moving shape that is on no link. A sphere in a heap has six neighbours, which is three pairs each."""
 
 MOST_CLOSING = 96
 """Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
@@ -185,22 +189,21 @@ def _takes_contacts(scene: Scene, found: Layout) -> bool:
     room = (MOST_ROWS - _own_rows(scene, found)) // _rows_of_a_point(scene)
     if scene.broadphase is None:
         return room >= 0
-    fewest = min(scene.place_count, scene.options.touching_capacity or FEWEST_TOUCHING)
-    return room >= fewest * _most_points(scene)
+    return room >= _touching_capacity(scene, found) * max(group.point_count for group in scene.compact_groups)
 
 
-@functools.cache
 def touching_capacity(scene: Scene) -> int:
-    """Pairs of the broadphase that can touch at the same time, where mechanisms take contacts: one for each moving shape.
-
-    As far as there is room for them.
-    """
+    """Pairs of the broadphase that can touch at the same time, where mechanisms take contacts."""
     found = layout(scene)
     assert found is not None
-    moving = sum(not scene.static[scene.shapes[entry].body] for entry in _close_shapes(scene))
-    wanted = scene.options.touching_capacity or max(FEWEST_TOUCHING, moving)
-    room = (MOST_ROWS - _own_rows(scene, found)) // (_rows_of_a_point(scene) * _most_points(scene))
-    return min(scene.place_count, wanted, room)
+    return _touching_capacity(scene, found)
+
+
+def _touching_capacity(scene: Scene, found: Layout) -> int:
+    bodies = [scene.shapes[entry].body for entry in _close_shapes(scene)]
+    links = {scene.dynamic_bodies[block] for block in found.blocks}
+    wanted = sum(1 if body in links else TOUCHING_A_FREE_SHAPE for body in bodies if not scene.static[body])
+    return min(scene.place_count, scene.options.touching_capacity or max(FEWEST_TOUCHING, wanted))
 
 
 def _own_rows(scene: Scene, found: Layout) -> int:
@@ -211,11 +214,6 @@ def _own_rows(scene: Scene, found: Layout) -> int:
 
 def _rows_of_a_point(scene: Scene) -> int:
     return 3 if scene.friction else 1
-
-
-def _most_points(scene: Scene) -> int:
-    """Points of a pair of the broadphase, at most."""
-    return max(group.point_count for group in scene.compact_groups)
 
 
 def _contacts_on_links(scene: Scene, found: Layout) -> bool:
