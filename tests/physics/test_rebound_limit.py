@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Fixed, Hinge, Plane, SceneBuilder, Sphere, contact_forces, energy, step
+from mathota_jax import Box, Distance, Fixed, Hinge, Plane, SceneBuilder, Sphere, contact_forces, energy, step
 from mathota_jax.constraints import mechanism_layout
 from tests.scenes import advance_worlds, repeat, rotation_matrix, undamped
 
@@ -22,8 +22,8 @@ LIMITED = FULL * np.linalg.norm(BEFORE) / np.linalg.norm(FULL)
 WALLS = (0.0, 1.0, 0.0), (0.6, -0.8, 0.0)
 
 
-def wedge(solver="pgs", walls=WALLS, carried=(), **options):
-    """A ball; some of its mass is `carried` by balls in its centre, welded to it."""
+def wedge(solver="pgs", walls=WALLS, carried=(), roped=False, **options):
+    """A ball; some of its mass is `carried` by balls in its centre, welded to it. If `roped`, others far away on a rope."""
     builder = SceneBuilder(gravity=(0, 0, 0))
     for normal, restitution in zip(walls, (1.0, 0.0), strict=False):
         builder.add_body(Plane(normal=normal, offset=0.0), static=True, friction=0.0, restitution=restitution)
@@ -32,9 +32,10 @@ def wedge(solver="pgs", walls=WALLS, carried=(), **options):
     ball = builder.add_body(Sphere(1.0), mass=MASS - sum(carried), **body)
     for mass in carried:
         builder.add_joint(Fixed(ball, builder.add_body(Sphere(0.5), mass=mass, collides=False, **body), place))
-    if options:
-        for far in (100.0, 200.0):
-            builder.add_body(Sphere(1.0), mass=1.0, position=(far, far, 0))
+    if options or roped:
+        far = [builder.add_body(Sphere(1.0), mass=1.0, position=(place, place, 0)) for place in (100.0, 200.0)]
+        if roped:
+            builder.add_joint(Distance(*far, (100.0, 100.0, 0), lengths=(0.0, 500.0)))
     return builder.build(undamped(dt=DT, solver=solver, velocity_iterations=80, **options))
 
 
@@ -45,12 +46,13 @@ def wedge(solver="pgs", walls=WALLS, carried=(), **options):
         ("converged", (), {}),
         ("pgs", (1.98,), {}),
         ("pgs", (0.4, 0.3, 0.3), {"broadphase": "all_pairs"}),
+        ("pgs", (0.4, 0.3, 0.3), {"roped": True}),
     ],
-    ids=["pgs", "converged", "welded", "welded and swept"],
+    ids=["pgs", "converged", "welded", "welded, beside a broadphase", "welded and swept"],
 )
 def test_energy_is_kept(precision, gate, solver, carried, options):
     model, state = wedge(solver, carried=carried, **options)
-    assert mechanism_layout.takes_contacts(model.scene) == bool(carried and not options)
+    assert mechanism_layout.takes_contacts(model.scene) == bool(carried and "roped" not in options)
     final = step(model, state)
     tolerance = 1e-4 if precision == "float32" else 1e-9
     gate("velocity after the impact [m/s]", np.asarray(final.velocity[BALL], float) - LIMITED, tolerance)
