@@ -10,7 +10,13 @@ from mathota_jax import measured
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
-from mathota_jax.constraints.mechanism_layout import bounded_slots, layout, takes_contacts, touching_capacity
+from mathota_jax.constraints.mechanism_layout import (
+    bounded_slots,
+    layout,
+    rows_of_a_point,
+    takes_contacts,
+    touching_capacity,
+)
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -77,7 +83,7 @@ def _rows(scene: Scene) -> list[str]:
     tables = (*contact_tables(scene), *joint_tables(scene)) if scene.joints else contact_tables(scene)
     turns = sum(table.turn_count for table in tables)
     most = sum(tier.turn_count for group in scene.compact_groups for tier in group.tiers)
-    rows = scene.slot_count * (3 if scene.friction else 1)
+    rows = scene.slot_count * rows_of_a_point(scene)
     touching = ""
     if scene.broadphase is not None and takes_contacts(scene):
         touching = f", those of up to {touching_capacity(scene)} close pairs at a time"

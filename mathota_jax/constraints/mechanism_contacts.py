@@ -50,7 +50,7 @@ class _Class(NamedTuple):
     members: tuple[int, ...]
     points: int
 
-    def rows(self, table: Table | TracedTable, rows: int) -> np.ndarray:
+    def rows(self, table: Table, rows: int) -> np.ndarray:
         """(member, point, row) places among the rows of the table, in the order turn, column, row; `rows` are of a point."""
         columns = np.asarray(self.members)[:, None] * table.together + np.arange(self.points)
         return columns[..., None] * rows + np.arange(rows)
@@ -81,7 +81,10 @@ class Reduced(NamedTuple):
 
     def contacts(self, groups: Sequence[Rows]) -> list[Rows]:
         """Those of all contacts that have places here, with laws and biases of `groups`: laws of all contacts."""
-        return _with_places(groups, self.close, self.touching)
+        if self.close is None or self.touching is None:
+            return [*groups]
+        count = len(groups) - len(self.touching.tables)
+        return [*groups[:count], self.touching.with_laws(self.close, groups[count:])]
 
     def with_biases(self, contacts: Sequence[Rows]) -> Reduced:
         """The same with those of `contacts`."""
@@ -117,13 +120,6 @@ def reduce(
         rows.append(_joint_group(joint_rows, bounded, matrix))
     rows += contact_groups(contacts, matrix, first)
     return Reduced(sides, velocity, matrix, tuple(rows), close, found)
-
-
-def _with_places(groups: Sequence[Rows], close: Rows | None, found: Touching | None) -> list[Rows]:
-    if close is None or found is None:
-        return [*groups]
-    count = len(groups) - len(found.tables)
-    return [*groups[:count], found.with_laws(close, groups[count:])]
 
 
 def to_reduced(

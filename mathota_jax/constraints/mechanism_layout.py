@@ -186,7 +186,7 @@ def _takes_contacts(scene: Scene, found: Layout) -> bool:
         return False
     if not _contacts_on_links(scene, found):
         return False
-    room = (MOST_ROWS - _own_rows(scene, found)) // _rows_of_a_point(scene)
+    room = (MOST_ROWS - _own_rows(scene, found)) // rows_of_a_point(scene)
     if scene.broadphase is None:
         return room >= 0
     return room >= _touching_capacity(scene, found) * max(group.point_count for group in scene.compact_groups)
@@ -209,17 +209,18 @@ def _touching_capacity(scene: Scene, found: Layout) -> int:
 def _own_rows(scene: Scene, found: Layout) -> int:
     """Rows of joints with bounds, and of the pairs that have slots of their own."""
     points = sum(int((table.order != EMPTY).sum()) for table in contact_tables(scene))
-    return len(_bounded_slots(scene, found)) + points * _rows_of_a_point(scene)
+    return len(_bounded_slots(scene, found)) + points * rows_of_a_point(scene)
 
 
-def _rows_of_a_point(scene: Scene) -> int:
+def rows_of_a_point(scene: Scene) -> int:
+    """Of a contact."""
     return 3 if scene.friction else 1
 
 
 def _contacts_on_links(scene: Scene, found: Layout) -> bool:
     links = {scene.dynamic_bodies[block] for block in found.blocks}
-    own = {body for group in scene.pair_groups for side in (group.bodies_a, group.bodies_b) for body in side}
-    return bool(links & (own | {scene.shapes[entry].body for entry in _close_shapes(scene)}))
+    bodies = {body for side in scene.slot_bodies for body in side}
+    return bool(links & (bodies | {scene.shapes[entry].body for entry in _close_shapes(scene)}))
 
 
 def _close_shapes(scene: Scene) -> tuple[int, ...]:

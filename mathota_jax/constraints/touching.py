@@ -68,7 +68,7 @@ class Touching:
     def of_tables(self, values: Sequence[Array]) -> Array:
         """(place, row, point, world) from (turn, row, column, world) of the tables; 0 where nothing touches."""
         return self._of_constraints(
-            [self._padded(_by_constraint(table, value), -2) for table, value in zip(self.tables, values, strict=True)],
+            [self._padded(_by_constraint(table, value)) for table, value in zip(self.tables, values, strict=True)],
             0,
         )
 
@@ -95,17 +95,15 @@ class Touching:
                 # The other side is no body at all.
                 parts[1:] = [jnp.zeros_like(part) for part in parts[1:]] + parts[1:]
                 sides.insert(0, jnp.zeros_like(sides[0]))
-            packed.append(self._padded(_by_constraint(group.table, jnp.concatenate(parts, axis=2)), -2))
+            packed.append(self._padded(_by_constraint(group.table, jnp.concatenate(parts, axis=2))))
             inertias.append([_by_constraint(group.table, side) for side in sides])
         inertia = tuple(self._of_constraints(side, 0) for side in zip(*inertias, strict=True))
         return Points(self._of_constraints(packed, 0), inertia).dense()
 
-    def _padded(self, values: Array, axis: int) -> Array:
-        """With as many points as all tables."""
-        missing = self.points - values.shape[axis]
-        widths = [(0, 0)] * values.ndim
-        widths[axis] = (0, missing)
-        return jnp.pad(values, widths) if missing else values
+    def _padded(self, values: Array) -> Array:
+        """(..., point, world) with as many points as all tables."""
+        missing = self.points - values.shape[-2]
+        return jnp.pad(values, [*[(0, 0)] * (values.ndim - 2), (0, missing), (0, 0)]) if missing else values
 
     def _of_constraints(self, values: Sequence[Array], otherwise: int) -> Array:
         """(place, ..., world) from (constraint, ..., world) of each table."""

@@ -101,20 +101,25 @@ def test_a_leg_sleeps_and_wakes_as_a_whole(gate):
     assert not np.asarray(is_asleep(model, pushed))[bodies].any()
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-def test_a_leg_carries_a_free_ball(precision, gate):
-    """Rows of bodies that are no links are part of the same system."""
-    builder = on_ground()
+def carry_a_ball(builder, options, gate):
+    """Model and final state of a leg that stands and carries a free ball on a plate."""
     last = leg(builder, LIGHT)[-1]
     plate = builder.add_body(Box((0.1, 0.02, 0.1)), mass=0.5, position=(0, 0.66, 0))
     builder.add_joint(Fixed(last, plate, (0, 0.64, 0)))
     builder.add_body(Sphere(0.1), mass=20.0, position=(0, 0.78, 0))
-    model, state = builder.build(undamped(dt=1 / 60))
+    model, state = builder.build(options)
     assert mechanism_layout.takes_contacts(model.scene)
     final = stand(model, state)
     gate("moved [m]", np.asarray(final.position - state.position, float), 2e-5)
     borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
     gate("borne by ground and plate / truth - 1", borne / (GRAVITY * (sum(LIGHT) + 0.5 + 2 * 20.0)) - 1, 1e-4)
+    return model, final
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_leg_carries_a_free_ball(precision, gate):
+    """Rows of bodies that are no links are part of the same system."""
+    carry_a_ball(on_ground(), undamped(dt=1 / 60), gate)
 
 
 def slide(speed=2.0, friction=0.25, dt=1 / 60, steps=24):
@@ -137,11 +142,8 @@ def test_a_sled_slides_as_one_body(precision, gate):
     gate("joint gaps [m]", np.asarray(joint_gaps(model, final).translation, float), 1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
-def test_derivatives_of_a_sled(float64, gate, mode):
-    """By the speed, the coefficients of friction and gravity."""
-    model, state, bodies, time, steps = slide()
+def derivatives_of_way(model, state, bodies, time, steps, mode):
+    """Of a sled's way by its speed, the coefficients of friction and gravity, over those of ``v t - mu g t^2 / 2``."""
 
     def way(speed, friction, gravity):
         moving = state.velocity.at[jnp.asarray(bodies), 0].set(speed)
@@ -154,8 +156,13 @@ def test_derivatives_of_a_sled(float64, gate, mode):
 
     at = (2.0, 0.25, GRAVITY)
     truth = np.array([time, -GRAVITY * time**2 / 2, -0.25 * time**2 / 2])
-    found = np.asarray(jax.jit(mode(way, (0, 1, 2)))(*at))
-    gate("derivatives / truth - 1", found / truth - 1, 1e-4)
+    return np.asarray(jax.jit(mode(way, (0, 1, 2)))(*at)) / truth
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
+def test_derivatives_of_a_sled(float64, gate, mode):
+    gate("derivatives / truth - 1", derivatives_of_way(*slide(), mode) - 1, 1e-4)
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)

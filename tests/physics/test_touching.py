@@ -11,7 +11,7 @@ from mathota_jax import Box, Fixed, Hinge, SceneBuilder, Sphere, contact_forces,
 from mathota_jax.constraints import mechanism_layout
 from mathota_jax.state import Flag
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.physics.test_mechanism_contacts import LIGHT, leg, on_ground
+from tests.physics.test_mechanism_contacts import LIGHT, carry_a_ball, derivatives_of_way, leg, on_ground
 from tests.scenes import DOWN, GRAVITY, quadruped, stiffened, undamped
 
 
@@ -36,16 +36,8 @@ def takes_contacts(model):
 def test_a_leg_carries_a_free_ball(precision, ground, gate):
     """Foot on the ground, ball on a plate: pairs of one moving body and of two, of one point and of four."""
     builder = {"plane": on_ground, "slab": on_slab}[ground]()
-    last = leg(builder, LIGHT)[-1]
-    plate = builder.add_body(Box((0.1, 0.02, 0.1)), mass=0.5, position=(0, 0.66, 0))
-    builder.add_joint(Fixed(last, plate, (0, 0.64, 0)))
-    builder.add_body(Sphere(0.1), mass=20.0, position=(0, 0.78, 0))
-    model, state = builder.build(close())
+    model, final = carry_a_ball(builder, close(), gate)
     assert takes_contacts(model)
-    final = jax.jit(lambda state: rollout(model, state, 120)[0])(state)
-    gate("moved [m]", np.asarray(final.position - state.position, float), 2e-5)
-    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
-    gate("borne by ground and plate / truth - 1", borne / (GRAVITY * (sum(LIGHT) + 0.5 + 2 * 20.0)) - 1, 1e-4)
     assert not final.flags
 
 
@@ -94,21 +86,7 @@ def test_derivatives_of_a_sled(float64, gate, mode):
     bodies = leg(builder, (0.2, 2.0, 5.0), (0.6, 0.02, 0.3), 2.0, 0.25)
     model, state = builder.build(close(velocity_iterations=40))
     assert takes_contacts(model)
-    steps = 24
-    time = steps / 60
-
-    def way(speed, friction, gravity):
-        moving = state.velocity.at[jnp.asarray(bodies), 0].set(speed)
-        changed = dataclasses.replace(
-            model,
-            friction=jnp.full_like(model.friction, friction),
-            gravity=jnp.asarray([0.0, -1.0, 0.0]) * gravity,
-        )
-        return rollout(changed, dataclasses.replace(state, velocity=moving), steps)[0].position[bodies[-1], 0]
-
-    at = (2.0, 0.25, GRAVITY)
-    truth = np.array([time, -GRAVITY * time**2 / 2, -0.25 * time**2 / 2])
-    gate("derivatives / truth - 1", np.asarray(jax.jit(mode(way, (0, 1, 2)))(*at)) / truth - 1, 1e-4)
+    gate("derivatives / truth - 1", derivatives_of_way(model, state, bodies, 24 / 60, 24, mode) - 1, 1e-4)
 
 
 def pincers(options):
