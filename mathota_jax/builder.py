@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from jax import Array
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.plan import plan_broadphase
 from mathota_jax.constraints.joint_layout import joint_row_count
+from mathota_jax.constraints.mechanism_layout import links_with_swept_contacts
 from mathota_jax.constraints.warm_start import matches_by_distance
 from mathota_jax.declarations import UNTURNED, Body, boolean, look_up, look_up_all, mass_properties, number
 from mathota_jax.geometry import SHAPES, Compound, Shape
@@ -206,6 +208,9 @@ class SceneBuilder:
 
         Raises:
           ValueError: no body, or a pair of shapes that can not collide (the message names both bodies).
+
+        Warns:
+          UserWarning: contacts of a robot are swept in turn with its joints, so that it may sink into the ground.
         """
         options = Options() if options is None else options
         if not isinstance(options, Options):
@@ -214,6 +219,15 @@ class SceneBuilder:
             raise ValueError("build: the scene has no body; call add_body first")
         table = shape_table(self._bodies)
         scene = self._scene(table, options)
+        if (links := links_with_swept_contacts(scene)) is not None:
+            warnings.warn(
+                f"build: the contacts of '{links[0]}' to '{links[-1]}', {len(links)} bodies with joints, are swept in turn "
+                "with their joints, since those that may touch at a time are too many to be solved with the joints held. "
+                "What stands on light feet will sink. Leave pairs out (SceneBuilder.ignore_collisions), allow fewer to "
+                'touch at a time (Options.touching_capacity), or pass solver="converged"; exact_joints=False if this is '
+                "what you want",
+                stacklevel=2,
+            )
         return self._model(scene, table, options.dt), self._state(scene)
 
     def _scene(self, table: ShapeTable, options: Options) -> Scene:

@@ -9,14 +9,9 @@ from collections.abc import Iterable
 from mathota_jax import measured
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
+from mathota_jax.constraints.contact_room import rows_of_a_point
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
-from mathota_jax.constraints.mechanism_layout import (
-    bounded_slots,
-    layout,
-    rows_of_a_point,
-    takes_contacts,
-    touching_capacity,
-)
+from mathota_jax.constraints.mechanism_layout import bounded_slots, contact_places, layout, takes_contacts
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -85,8 +80,10 @@ def _rows(scene: Scene) -> list[str]:
     most = sum(tier.turn_count for group in scene.compact_groups for tier in group.tiers)
     rows = scene.slot_count * rows_of_a_point(scene)
     touching = ""
-    if scene.broadphase is not None and takes_contacts(scene):
-        touching = f", those of up to {touching_capacity(scene)} close pairs at a time"
+    room = contact_places(scene)
+    if room is not None and room.count:
+        which = "all" if room.for_all else "those of close pairs"
+        touching = f" ({which} in up to {room.count} places of {room.points} points at a time)"
     return [
         f"contact slots: {scene.slot_count}",
         f"rows: {rows} of contacts{touching}, {joint_row_count(scene)} of joints",

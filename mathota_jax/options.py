@@ -49,10 +49,11 @@ class Options:
       pair_capacity: pairs that the broadphase can find in one step; None for all of up to 300 possible ones, else 8 for
         each moving shape and at least 100. Empty places cost memory traffic: 27 boxes in a bin, of whose pairs 30 are
         close, take 1.4 times as long with this room (216) as with room for 40.
-      touching_capacity: pairs of the broadphase that can touch at the same time where contacts are solved with the joints
-        held (see `exact_joints`); None for one for each moving shape of a link, four for each other one, and at least 8.
-        Each takes a place in a dense matrix: what touches beyond them passes through (`Flag.CONTACT_OVERFLOW`). Where they
-        are too many for the matrix, fewer may be asked for.
+      touching_capacity: pairs that can touch at the same time where contacts are solved with the joints held (see
+        `exact_joints`), beside those that always have rows; pairs with the most points, or more with fewer. None for one
+        for each moving shape of a link, four for each other one, and at least 8. They take places in a dense matrix: what
+        touches beyond them passes through (`Flag.CONTACT_OVERFLOW`). Where the matrix has too little room, fewer may be
+        asked for.
       gradient_iterations: sweeps of the linear solver behind a derivative; None for 1.5 times the solver's own where all
         rows are contacts with friction, for which they are accelerated, and for twice as many elsewhere. What mechanisms
         solve with their joints held takes its derivative from one dense system instead.
@@ -71,8 +72,8 @@ class Options:
         restitution pass. All figures: docs/solvers.md.
       exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the end of
         the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot stands on feet
-        of any mass, where there are up to 192 rows of contacts, motors, friction and stops together, those of the
-        broadphase with `touching_capacity` pairs, and no other joints. Elsewhere three and more joints, or fewer where a
+        of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a broadphase or of many
+        pairs for what touches at a time, and there are no other joints. Elsewhere three and more joints, or fewer where a
         scene has nothing else to solve ("soft_step": there alone); one or two beside several contacts that bounce, and
         nets whose loops more than 96 rows close, are left to the solver. Off: absent. Limits, motors, springs and friction
         on their joints are solved with all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an

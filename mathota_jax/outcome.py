@@ -11,7 +11,7 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, place
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.constraints import compact, compact_matching, joint_layout, loops
+from mathota_jax.constraints import compact_matching, joint_layout, loops
 from mathota_jax.constraints.assembly import collect
 from mathota_jax.constraints.contact_force import slot_force
 from mathota_jax.constraints.decoupling import Decoupling
@@ -66,8 +66,8 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
         changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
         if problem.offsets is not None:
             changes["contact_offset"] = jnp.stack(problem.offsets, axis=1)
-        if problem.contacts.converged is not None or problem.close is not None:
-            flags.append(_collision_flags(problem.contacts, problem.close))
+        if problem.contacts.converged is not None or problem.overflow is not None:
+            flags.append(_collision_flags(problem.contacts, problem.overflow))
         if problem.close is not None:
             changes["contact_pair"] = compact_matching.pair_keys(scene, problem.close)
     return {**changes, "flags": functools.reduce(jnp.bitwise_or, flags)} if flags else changes
@@ -102,12 +102,12 @@ def _original(impulse: Array, decoupling: Decoupling | None) -> Array:
     return decoupling.original_impulses(impulse.reshape(-1, impulse.shape[-1])).reshape(impulse.shape)
 
 
-def _collision_flags(contacts: ContactSet, close: compact.ClosePairs | None) -> Array:
+def _collision_flags(contacts: ContactSet, overflow: Array | None) -> Array:
     """Bits (world,) for what the collision phases could not do."""
     flags = jnp.zeros(contacts.separation.shape[-1:], jnp.int32)
     if contacts.converged is not None:
         failed = (contacts.active & ~contacts.converged).any(0)
         flags = flags | jnp.where(failed, int(Flag.NOT_CONVERGED), 0)
-    if close is not None:
-        flags = flags | jnp.where(close.overflow, int(Flag.CONTACT_OVERFLOW), 0)
+    if overflow is not None:
+        flags = flags | jnp.where(overflow, int(Flag.CONTACT_OVERFLOW), 0)
     return flags

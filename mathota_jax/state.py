@@ -22,8 +22,7 @@ class Flag(enum.IntFlag):
 
     CONTACT_OVERFLOW = 2
     """More pairs were close to each other than `Options.pair_capacity`, or than fit around one body, or touched than
-    `Options.touching_capacity`; the deepest were kept as far as there was room, the others passed through each other in
-    this step."""
+    `Options.touching_capacity`; the deepest were kept as far as there was room, the others passed through in this step."""
 
     NOT_CONVERGED = 4
     """The search for the closest points of two shapes ended at its limit; the best bound that it found was used."""

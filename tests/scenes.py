@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Sphere, contacts, step
+from mathota_jax import Box, Capsule, Fixed, Hinge, Options, Plane, SceneBuilder, Sphere, contacts, step
 
 GRAVITY = 9.81
 DOWN = (0.0, -GRAVITY, 0.0)
@@ -160,10 +160,41 @@ def quadruped(drive: str, options: Options, ignores_itself: bool = True, tiles: 
     return builder.build(options)
 
 
-def add_driven_hinge(builder: SceneBuilder, drive: str, parent: int, child: int, anchor: Any) -> None:
+def humanoid(options: Options) -> tuple[Any, Any]:
+    """A body of 15 links and 52.4 kg upright on a plane, which may touch itself: 105 pairs beside the 15 with the plane.
+
+    Limits and servos ("servo" of `stiffened`) on its 12 hinges, which are all about z; the hands are welded.
+    """
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=1.0)
+    across = axis_angle((1, 0, 0), np.pi / 2)
+    pelvis = builder.add_body(Capsule(0.09, 0.08), mass=8.0, position=(0, 0.95, 0), orientation=across)
+    chest = builder.add_body(Box((0.1, 0.17, 0.16)), mass=16.0, position=(0, 1.25, 0))
+    head = builder.add_body(Sphere(0.1), mass=4.0, position=(0, 1.55, 0))
+    hinges = [(pelvis, chest, (0, 1.06, 0)), (chest, head, (0, 1.44, 0))]
+    for side in (-1.0, 1.0):
+        z, w = 0.1 * side, 0.24 * side
+        thigh = builder.add_body(Capsule(0.06, 0.13), mass=5.0, position=(0, 0.69, z))
+        shin = builder.add_body(Capsule(0.045, 0.14), mass=3.0, position=(0, 0.28, z))
+        foot = builder.add_body(Box((0.1, 0.03, 0.045)), mass=0.8, position=(0.03, 0.03, z))
+        hinges += [(pelvis, thigh, (0, 0.88, z)), (thigh, shin, (0, 0.48, z)), (shin, foot, (0, 0.08, z))]
+        upper = builder.add_body(Capsule(0.04, 0.1), mass=1.8, position=(0, 1.24, w))
+        fore = builder.add_body(Capsule(0.035, 0.1), mass=1.2, position=(0, 0.96, w))
+        hand = builder.add_body(Sphere(0.045), mass=0.4, position=(0, 0.8, w))
+        hinges += [(chest, upper, (0, 1.38, w)), (upper, fore, (0, 1.1, w))]
+        builder.add_joint(Fixed(fore, hand, (0, 0.85, w)))
+    for parent, child, anchor in hinges:
+        add_driven_hinge(builder, "servo", parent, child, anchor, limits=(-2.0, 2.0))
+    return builder.build(options)
+
+
+def add_driven_hinge(
+    builder: SceneBuilder, drive: str, parent: int, child: int, anchor: Any, limits: Any = None
+) -> None:
     """A hinge about z with a "spring" or a "servo" of 1 N m/rad and 1 N m s/rad."""
     gains = {"stiffness": 1.0, "damping": 1.0}
-    hinge = Hinge(parent=parent, child=child, anchor=anchor, axis=(0, 0, 1), **(gains if drive == "spring" else {}))
+    spring = gains if drive == "spring" else {}
+    hinge = Hinge(parent=parent, child=child, anchor=anchor, axis=(0, 0, 1), limits=limits, **spring)
     handle = builder.add_joint(hinge)
     if drive == "servo":
         builder.add_motor(handle, kind="position", limit=10.0, **gains)

@@ -30,6 +30,7 @@ from mathota_jax.constraints.assembly import (
 )
 from mathota_jax.constraints.effective_mass import first_grip, normal_bound, step_length, tangent_bound
 from mathota_jax.constraints.impact import Approach, impact, loaded, rebound
+from mathota_jax.constraints.mechanism_layout import contact_places
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Cone, Push
@@ -87,6 +88,8 @@ class ContactRows(NamedTuple):
         need a limit.
       sign: (turn, 1, world) of the directions that the matrix keeps; None where it is +.
       load: what becomes of the lever where a rebound also carries others; None where nothing bounces.
+      ahead: (turn, 1, column, world) lowest separation at the end of the step if nothing held the bodies; None where places
+        are not given by it (`touching`).
     """
 
     rows: Rows
@@ -98,6 +101,7 @@ class ContactRows(NamedTuple):
     falling: Array | None = None
     sign: Array | None = None
     load: Load | None = None
+    ahead: Array | None = None
 
 
 class PlacedPairs(NamedTuple):
@@ -162,8 +166,9 @@ def contact_rows(
     points = _points(scene, table, chosen, directions, motion, pairs, worlds)
     # Points are less to read, which pays where sweeps go through lists; where pairs have turns of their own, sweeps have
     # fewer kernels with all entries. The other solvers need those.
-    listed = pairs is not None and scene.options.solver == "pgs"
-    matrix = points.stored() if listed else points.dense()
+    room = contact_places(scene)
+    listed = pairs is not None or (room is not None and room.for_all)
+    matrix = points.stored() if listed and scene.options.solver == "pgs" else points.dense()
     # Stored for reverse mode: else their cotangents are computed again for each entry of the Jacobians.
     start, free = (
         compute_once(along.reshape(-1, along.shape[-1]), chosen.separation)
@@ -209,6 +214,9 @@ def contact_rows(
     if scene.rebounds_may_gain:
         side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
         falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
+    ahead = None
+    if room is not None and room.count:
+        ahead = pack_scalars(table, [chosen.separation + model.dt * jnp.minimum(start, free)], worlds)
     return ContactRows(
         rows,
         pack_scalars(table, [lever], worlds),
@@ -218,6 +226,7 @@ def contact_rows(
         size,
         falling,
         load=load,
+        ahead=ahead,
     )
 
 

@@ -22,7 +22,7 @@ from jax import Array, lax
 from mathota_jax.constraints import contact, mechanism_links, row_sides
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
-from mathota_jax.constraints.mechanism_layout import bounded_slots, touching_capacity
+from mathota_jax.constraints.mechanism_layout import bounded_slots, contact_places
 from mathota_jax.constraints.mechanism_rows import of_slots, respond, to_tables, with_tree
 from mathota_jax.constraints.touching import Touching, touching
 from mathota_jax.scene import Scene
@@ -64,7 +64,7 @@ class Reduced(NamedTuple):
       velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
       matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
       rows: one group for the rows with bounds on joints, if there are any, then one for each class of each contact table.
-      close: the last of these, of contacts that the broadphase found, as they act on single bodies; None without one.
+      close: the last of these, of contacts that have places, as they act on single bodies; None if all have rows.
       touching: which these are.
     """
 
@@ -105,12 +105,14 @@ def reduce(
     """The rows of a scene whose mechanisms take contacts, from those that act on single bodies."""
     contacts = [group.rows for group in groups]
     worlds = max(leaf.shape[-1] for leaf in (links.offset.x, *(group.bias for group in (*joint_rows, *contacts))))
-    traced = [group for group in groups if isinstance(group.rows.table, TracedTable)]
-    contacts, found = contacts[: len(contacts) - len(traced)], None
+    room = contact_places(scene)
+    assert room is not None
+    count = len(_fixed_tables(scene))
+    contacts, traced, found = contacts[:count], groups[count:], None
     fixed = (*joint_rows, *contacts)
     sides, close = row_sides.RowSides(row_sides.fixed_sides(fixed, _places(scene, joint_rows, contacts), worlds)), None
     if traced:
-        found = touching(traced, touching_capacity(scene))
+        found = touching(traced, room.count, room.points)
         close = found.rows([group.rows for group in traced])
         sides, contacts = sides._replace(traced=row_sides.traced_sides(close, worlds)), [*contacts, close]
     velocity, matrix = respond(links, sides, worlds)
@@ -129,7 +131,7 @@ def to_reduced(
     bounded = bounded_slots(scene)
     joints, contacts = values[: len(joint_rows)], values[len(joint_rows) :]
     found = [of_slots(joint_rows, bounded, joints)[:, None, None]] if bounded else []
-    tables = contact.contact_tables(scene)
+    tables = _fixed_tables(scene)
     found += _by_class(tables, contacts[: len(tables)])
     return (*found, reduced.touching.of_tables(contacts[len(tables) :])) if reduced.touching else tuple(found)
 
@@ -163,7 +165,7 @@ def from_reduced(
     own, close = values[bool(bounded) :], []
     if reduced.touching is not None:
         own, close = own[:-1], reduced.touching.to_tables(own[-1])
-    return (*joints, *_by_turn(contact.contact_tables(scene), own), *close)
+    return (*joints, *_by_turn(_fixed_tables(scene), own), *close)
 
 
 def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows, ...], Array]:
@@ -184,6 +186,12 @@ def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows,
 def change(velocity: Array, impulses: Sequence[Array]) -> Array:
     """(component, block, world) from those under unit impulses of rows (component, block, row, world), and impulses."""
     return add_scaled(velocity, in_order(impulses))
+
+
+def _fixed_tables(scene: Scene) -> tuple[Table, ...]:
+    """Of the contacts each point of which has rows; they come first."""
+    room = contact_places(scene)
+    return () if room is not None and room.for_all else contact.contact_tables(scene)
 
 
 def _places(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows]) -> np.ndarray:

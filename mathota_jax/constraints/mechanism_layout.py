@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mathota_jax.constraints.contact import contact_tables
+from mathota_jax.constraints.contact_room import Places, places_for
 from mathota_jax.constraints.joint_layout import JointGroup, joint_groups, joint_row_count
 from mathota_jax.scene import Scene
-from mathota_jax.solver.table import EMPTY
 from mathota_jax.solver.tree import GROUND, Tree
 
 _Slots = tuple[tuple[int, ...], tuple[int, ...]]
@@ -19,17 +18,6 @@ _Slots = tuple[tuple[int, ...], tuple[int, ...]]
 LEAST_JOINTS = 3
 """Joints of the smallest mechanism beside rows that are swept in turn with it: two converge in a few sweeps, which are
 cheaper. Elsewhere one is enough."""
-
-MOST_ROWS = 192
-"""Rows of contacts and with bounds of the largest scene in which they are solved with the joints held: the matrix grows with
-their square."""
-
-FEWEST_TOUCHING = 8
-"""Pairs of the broadphase that can touch at the same time where contacts are solved with the joints held, at least: one for
-each shape of a link, and more for free ones, which lie in heaps."""
-
-TOUCHING_A_FREE_SHAPE = 4
-"""Of those, for each moving shape that is on no link. A sphere in a heap has six neighbours, which is three pairs each."""
 
 MOST_CLOSING = 96
 """Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
@@ -184,48 +172,21 @@ def _takes_contacts(scene: Scene, found: Layout) -> bool:
         return False
     if _row_count(found) + len(_bounded_slots(scene, found)) != joint_row_count(scene):
         return False
-    if not _contacts_on_links(scene, found):
-        return False
-    room = (MOST_ROWS - _own_rows(scene, found)) // rows_of_a_point(scene)
-    if scene.broadphase is None:
-        return room >= 0
-    return room >= _touching_capacity(scene, found) * max(group.point_count for group in scene.compact_groups)
+    return _contacts_on_links(scene, found) and _places(scene, found) is not None
 
 
-def touching_capacity(scene: Scene) -> int:
-    """Pairs of the broadphase that can touch at the same time, where mechanisms take contacts."""
-    found = layout(scene)
-    assert found is not None
-    return _touching_capacity(scene, found)
-
-
-def _touching_capacity(scene: Scene, found: Layout) -> int:
-    bodies = [scene.shapes[entry].body for entry in _close_shapes(scene)]
-    links = {scene.dynamic_bodies[block] for block in found.blocks}
-    wanted = sum(1 if body in links else TOUCHING_A_FREE_SHAPE for body in bodies if not scene.static[body])
-    return min(scene.place_count, scene.options.touching_capacity or max(FEWEST_TOUCHING, wanted))
-
-
-def _own_rows(scene: Scene, found: Layout) -> int:
-    """Rows of joints with bounds, and of the pairs that have slots of their own."""
-    points = sum(int((table.order != EMPTY).sum()) for table in contact_tables(scene))
-    return len(_bounded_slots(scene, found)) + points * rows_of_a_point(scene)
-
-
-def rows_of_a_point(scene: Scene) -> int:
-    """Of a contact."""
-    return 3 if scene.friction else 1
+def _places(scene: Scene, found: Layout) -> Places | None:
+    return places_for(scene, _link_bodies(scene, found), len(_bounded_slots(scene, found)))
 
 
 def _contacts_on_links(scene: Scene, found: Layout) -> bool:
-    links = {scene.dynamic_bodies[block] for block in found.blocks}
     bodies = {body for side in scene.slot_bodies for body in side}
-    return bool(links & (bodies | {scene.shapes[entry].body for entry in _close_shapes(scene)}))
+    close = () if scene.broadphase is None else scene.broadphase.shapes
+    return not _link_bodies(scene, found).isdisjoint(bodies | {scene.shapes[entry].body for entry in close})
 
 
-def _close_shapes(scene: Scene) -> tuple[int, ...]:
-    """Entries of the shapes whose pairs the broadphase finds."""
-    return () if scene.broadphase is None else scene.broadphase.shapes
+def _link_bodies(scene: Scene, found: Layout) -> frozenset[int]:
+    return frozenset(scene.dynamic_bodies[block] for block in found.blocks)
 
 
 def _row_count(found: Layout) -> int:
@@ -264,10 +225,26 @@ def covers_with_bounds(scene: Scene) -> bool:
 
 
 @functools.cache
-def takes_contacts(scene: Scene) -> bool:
-    """Whether all contacts of a scene, and all joint rows but those that always hold, are solved with the joints held."""
+def contact_places(scene: Scene) -> Places | None:
+    """Room for all contacts of a scene where they are solved with the joints held, like all rows that do not always hold.
+
+    None where they are not.
+    """
     found = layout(scene)
-    return found is not None and _takes_contacts(scene, found)
+    return _places(scene, found) if found is not None and _takes_contacts(scene, found) else None
+
+
+def takes_contacts(scene: Scene) -> bool:
+    """Whether all contacts of a scene are solved with the joints held."""
+    return contact_places(scene) is not None
+
+
+def links_with_swept_contacts(scene: Scene) -> list[str] | None:
+    """Names of the links whose contacts the default solver sweeps in turn with their joints; None where it does not."""
+    found = layout(scene)
+    if found is None or scene.options.solver != "pgs" or takes_contacts(scene) or not _contacts_on_links(scene, found):
+        return None
+    return [scene.body_names[body] for body in sorted(_link_bodies(scene, found))]
 
 
 @functools.cache

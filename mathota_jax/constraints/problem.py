@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -62,6 +63,14 @@ class Problem(NamedTuple):
     decouplings: tuple[Decoupling, ...] = ()
     offsets: Vec3 | None = None
     reduced: mechanism_contacts.Reduced | None = None
+
+    @property
+    def overflow(self) -> Array | None:
+        """Worlds (world,) where contacts found no room; None where there is room for all."""
+        found = [] if self.close is None else [self.close.overflow]
+        if self.reduced is not None and self.reduced.touching is not None:
+            found.append(self.reduced.touching.overflow)
+        return functools.reduce(jnp.logical_or, found) if found else None
 
     @property
     def of_joint_rows(self) -> tuple[Decoupling | None, ...]:
@@ -156,8 +165,6 @@ def constrain(
     reduced = None
     if held is not None and mechanism_layout.takes_contacts(scene):
         reduced = mechanism_contacts.reduce(scene, held, tables, contact_rows)
-        if close is not None and reduced.touching is not None:
-            close = close._replace(overflow=close.overflow | reduced.touching.overflow)
     return Problem(
         joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings, offsets, reduced
     )

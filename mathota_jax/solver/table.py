@@ -50,6 +50,11 @@ class Table:
         """Columns of each turn."""
         return len(self.slots[0])
 
+    @property
+    def constraint_count(self) -> int:
+        """Constraints of each turn."""
+        return self.column_count // self.together
+
     @functools.cached_property
     def order(self) -> np.ndarray:
         """(turn * column,) slots in the order of the table, EMPTY for padding."""

@@ -1,4 +1,7 @@
-"""Mechanisms in scenes with a broadphase: their contacts feel all that hangs on them there, too. Closed forms: statics."""
+"""Mechanisms whose possible contacts are more than a matrix holds: those that touch feel all that hangs on them, too.
+
+Closed forms: statics, dynamics.
+"""
 
 import dataclasses
 
@@ -7,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Fixed, Hinge, SceneBuilder, Sphere, contact_forces, rollout, step
+from mathota_jax import Box, Compound, Fixed, Hinge, SceneBuilder, Sphere, contact_forces, rollout, step
 from mathota_jax.constraints import mechanism_layout
 from mathota_jax.state import Flag
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.physics.test_mechanism_contacts import LIGHT, carry_a_ball, derivatives_of_way, leg, on_ground
-from tests.scenes import DOWN, GRAVITY, quadruped, stiffened, undamped
+from tests.physics.test_mechanism_contacts import LIGHT, carry_a_ball, derivatives_of_way, leg, on_ground, stand
+from tests.scenes import DOWN, GRAVITY, humanoid, quadruped, stiffened, undamped
 
 
 def close(**changes):
@@ -134,8 +137,67 @@ def test_a_robot_that_may_touch_itself_stands(precision, tiles, gate):
     assert not final.flags
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_humanoid_stands(precision, gate):
+    """Rows for all of its 33 points on the plane leave too little room: swept in turn with its joints it sat down."""
+    model, state = humanoid(undamped(dt=1 / 60))
+    assert takes_contacts(model) and mechanism_layout.contact_places(model.scene).for_all
+    model = stiffened(model, "servo", 3000.0, 100.0)
+    final = jax.jit(lambda state: rollout(model, state, 120)[0])(state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), 1e-4)
+    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-4)
+    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
+    gate("borne by the ground / weight - 1", borne / (52.4 * GRAVITY) - 1, 1e-4)
+    assert not final.flags
+
+
+def studded(options, friction=0.5, speed=0.0):
+    """Blocks of 57 kg welded on a foot of 0.2 kg with 70 studs, of which the four at its corners touch the ground."""
+    builder = on_ground(friction)
+    turned = (1.0, 0.0, 0.0, 0.0)
+    corners = [(x, 0.0, z) for x in (-0.6, 0.6) for z in (-0.3, 0.3)]
+    inner = [(x, 0.01, z) for x in np.linspace(-0.5, 0.5, 11) for z in np.linspace(-0.25, 0.25, 6)]
+    studs = Compound([(Sphere(0.02), (place, turned)) for place in (*corners, *inner)])
+    foot = builder.add_body(studs, mass=0.2, position=(0, 0.02, 0), velocity=(speed, 0, 0), friction=friction)
+    bodies = [foot]
+    for number, mass in enumerate((2.0, 5.0, 50.0)):
+        place = (0, 0.14 + 0.2 * number, 0)
+        block = Box((0.05, 0.1, 0.05))
+        body = builder.add_body(block, mass=mass, position=place, velocity=(speed, 0, 0), collides=False)
+        builder.add_joint(Fixed(bodies[-1], body, (0, 0.04 + 0.2 * number, 0)))
+        bodies.append(body)
+    return *builder.build(options), bodies
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+def test_a_leg_stands_on_a_foot_of_many_points(precision, gate):
+    """More rows than a matrix holds, without a broadphase. Where it has room for three points, a flag tells."""
+    model, state, _ = studded(undamped(dt=1 / 60, broadphase="none", velocity_iterations=40))
+    assert model.scene.broadphase is None and mechanism_layout.contact_places(model.scene).for_all
+    final = stand(model, state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), 3e-4)  # all of it in the first steps
+    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-5)
+    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
+    gate("borne by the ground / weight - 1", borne / (57.2 * GRAVITY) - 1, 1e-5)
+    assert not final.flags
+    model, state, _ = studded(undamped(dt=1 / 60, broadphase="none", touching_capacity=3))
+    assert mechanism_layout.contact_places(model.scene).count == 3
+    assert stand(model, state).flags == Flag.CONTACT_OVERFLOW
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_of_a_sled_on_many_points(float64, gate, mode):
+    model, state, bodies = studded(undamped(dt=1 / 60, broadphase="none", velocity_iterations=40), 0.25, 2.0)
+    assert mechanism_layout.contact_places(model.scene).for_all
+    gate("derivatives / truth - 1", derivatives_of_way(model, state, bodies, 24 / 60, 24, mode) - 1, 1e-4)
+
+
 def test_contacts_beyond_the_capacity_set_a_flag(gate):
-    """Three balls on a plate without friction, of which two find a place: the deepest ones. World by world."""
+    """Three balls on a plate without friction, of which two find a place: the deepest ones. World by world.
+
+    Of four places a foot with four points takes two.
+    """
     builder = on_slab(0.0)
     (foot,) = leg(builder, (0.2,), foot=(0.4, 0.02, 0.1), friction=0.0)
     plate = builder.add_body(Box((0.4, 0.02, 0.1)), mass=0.5, position=(0, 0.46, 0), friction=0.0)
@@ -143,9 +205,9 @@ def test_contacts_beyond_the_capacity_set_a_flag(gate):
     balls = [builder.add_body(Sphere(0.1), mass=1.0, position=(x, 0.58, 0), friction=0.0) for x in (-0.3, 0.0, 0.3)]
     builder.ignore_collisions(plate, "slab")
     builder.ignore_collisions(balls)
-    model, state = builder.build(close(touching_capacity=3))
+    model, state = builder.build(close(touching_capacity=2))
     assert takes_contacts(model) and not model.scene.friction
-    heights = jnp.asarray([[0.0, 0.0, 0.3], [-1e-4, 1e-5, -1e-4], [0.3, 0.3, 0.3], [0.3, 0.0, 0.0]])
+    heights = jnp.asarray([[0.0, 0.0, 0.3], [-1e-4, -1e-5, -1e-4], [0.3, 0.3, 0.3], [0.3, 0.0, 0.0]])
     order = jnp.asarray([2, 0, 3, 1])
     lifted = jax.vmap(lambda h: dataclasses.replace(state, position=state.position.at[jnp.asarray(balls), 1].add(h)))
     run = jax.jit(jax.vmap(lambda state: step(model, state)))
@@ -157,10 +219,11 @@ def test_contacts_beyond_the_capacity_set_a_flag(gate):
 
 
 def test_scenes_that_take_no_contacts_say_so():
-    """Too many rows for a dense matrix: nothing changes for these."""
+    """Too many contacts may touch at a time for a dense matrix: they are swept, which a warning tells."""
     builder = on_ground()
     leg(builder, LIGHT)
     for number in range(20):
         builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(2.0 + number, 0.1, 0))
-    model, _ = builder.build(undamped())
+    with pytest.warns(UserWarning, match="the contacts of 'body1' to 'body4', 4 bodies with joints, are swept"):
+        model, _ = builder.build(undamped())
     assert model.scene.broadphase is not None and not mechanism_layout.takes_contacts(model.scene)

@@ -90,7 +90,8 @@ def test_the_broadphase_and_its_capacities():
 
 def test_pairs_that_touch_with_the_joints_held():
     model, _ = quadruped("servo", Options(touching_capacity=5), ignores_itself=False)
-    assert lines(model)["rows"] == "276 of contacts, those of up to 5 close pairs at a time, 48 of joints"
+    places = "those of close pairs in up to 5 places of 2 points at a time"
+    assert lines(model)["rows"] == f"276 of contacts ({places}), 48 of joints"
 
 
 @pytest.mark.parametrize("options", [None, Options(sleep=True), Options(broadphase="all_pairs", sleep=True)])
