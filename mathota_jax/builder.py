@@ -222,10 +222,10 @@ class SceneBuilder:
         if (links := links_with_swept_contacts(scene)) is not None:
             warnings.warn(
                 f"build: the contacts of '{links[0]}' to '{links[-1]}', {len(links)} bodies with joints, are swept in turn "
-                "with their joints, since those that may touch at a time are too many to be solved with the joints held. "
-                "What stands on light feet will sink. Leave pairs out (SceneBuilder.ignore_collisions), allow fewer to "
-                'touch at a time (Options.touching_capacity), or pass solver="converged"; exact_joints=False if this is '
-                "what you want",
+                "with their joints: too many may touch at a time to be solved with the joints held, or there are joints "
+                "that are left to the sweeps. What stands on light feet will sink. Leave pairs out "
+                "(SceneBuilder.ignore_collisions), allow fewer to touch at a time (Options.touching_capacity), or pass "
+                'solver="converged"; exact_joints=False if this is what you want',
                 stacklevel=2,
             )
         return self._model(scene, table, options.dt), self._state(scene)

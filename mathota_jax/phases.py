@@ -230,7 +230,7 @@ def _solve_reduced(
     found = mechanism_sweeps.solve(scene, problem.joints, contacts, reduced, rates, first)
     impulses = mechanism_contacts.from_reduced(scene, problem.joint_rows, reduced, found)
     # What the joints take for it; the velocity is known better than their large impulses on light links would have it.
-    moved = begin.with_joints + reduced.change(found)
+    moved = begin.with_joints + reduced.change(mechanism_contacts.in_order(found))
     pushed = add_impulses(problem.rows, begin.velocity, impulses)
     return moved, mechanism.hold(held, problem.joint_rows, pushed, impulses)[1]
 
@@ -321,12 +321,18 @@ def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.
     """Displacement (component, block, world) out of what overlaps, of mechanisms as wholes."""
     percent, iterations = scene.options.position_percent, scene.options.position_iterations
     contacts = [contact.position_rows(group, displacement, percent) for group in problem.contact_rows]
-    rows, velocity = mechanism_contacts.normal_rows(reduced, contacts)
-    worlds = max(velocity.shape[-1], *(group.bias.shape[-1] for group in rows))
+    rows, still, chosen = mechanism_contacts.normal_rows(reduced, contacts)
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
-    still = jnp.zeros((velocity.shape[2], 1, worlds), velocity.dtype)
-    found = pgs.solve(iterations, _gradient_iterations(scene, rows, iterations), rows, still, start, still)[1]
-    return mechanism_contacts.change(velocity, found)
+    found = pgs.solve(iterations, 1, *lax.stop_gradient((rows, still, start, still)))[1]
+
+    def change(impulses: tuple[Array, ...]) -> Array:
+        of_chosen = mechanism_contacts.in_order(impulses)
+        return reduced.change(mechanism_contacts.scattered(of_chosen, chosen, reduced.delassus.count))
+
+    # What the matrix changes at these impulses: it has no derivative of its own.
+    left = take(reduced.rates(change(found)), chosen)
+    rows = mechanism_contacts.with_errors(rows, left - lax.stop_gradient(left))
+    return change(pgs.solve(0, _gradient_iterations(scene, rows, iterations), rows, still, found)[1])
 
 
 def close_joints(

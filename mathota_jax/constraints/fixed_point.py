@@ -18,11 +18,11 @@ from jax import Array, lax
 from jax.scipy.linalg import lu_solve
 
 from mathota_jax.constraints.mechanism_contacts import by_group, in_order
+from mathota_jax.solver.delassus import Delassus
 from mathota_jax.solver.implicit import jacobians_of
 from mathota_jax.solver.rows import Rows
 from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_scaled
 
 DELTA = {"float32": 1e-4, "float64": 1e-6}
 """Weight of the proximal term beside 1. Where redundant rows are not quite consistent, because the impulses are not quite
@@ -33,39 +33,35 @@ STEPS = 3
 
 
 @jax.custom_jvp
-def derive(rows: tuple[Rows, ...], matrix: Array, rates: Array, found: Array) -> Array:
+def derive(rows: tuple[Rows, ...], delassus: Delassus, errors: Array, found: Array) -> Array:
     """Impulses (row, world) that were `found`, with the derivative of the solution.
 
     Args:
       rows: groups of rows, of which laws and biases matter.
-      matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
-      rates: (row, world) without impulses.
+      delassus: of all rows, without derivative.
+      errors: (row, world) rates with the impulses `found`, as they depend on all else.
       found: (row, world), without derivative.
     """
-    del rows, matrix, rates
+    del rows, delassus, errors
     return found
 
 
 @derive.defjvp
 def _derive_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    rows, matrix, rates, _ = primals
-    d_rows, d_matrix, d_rates, _ = tangents
+    rows, delassus, errors, _ = primals
+    d_rows, _, d_errors, _ = tangents
     impulses = derive(*primals)
 
-    def errors_of(matrix: Array, rates: Array) -> tuple[Array, ...]:
-        return by_group(rows, rates + add_scaled(matrix, impulses))
-
-    def update(laws: Any, biases: Any, errors: tuple[Array, ...]) -> Array:
+    def update(laws: Any, biases: Any, errors: Array) -> Array:
         """What the laws make of the impulses."""
-        parts = zip(laws, by_group(rows, impulses), biases, errors, strict=True)
+        parts = zip(laws, by_group(rows, impulses), biases, by_group(rows, errors), strict=True)
         return in_order([law.update(impulse, bias + error) for law, impulse, bias, error in parts])
 
     of_rows, d_of_rows = (
         (tuple(group.law for group in groups), tuple(group.bias for group in groups)) for groups in (rows, d_rows)
     )
-    errors, d_errors = jax.jvp(errors_of, (matrix, rates), (d_matrix, d_rates))
     change = jax.jvp(update, (*of_rows, errors), (*d_of_rows, d_errors))[1]
-    return impulses, _solve(_system(rows, matrix, impulses, errors), change)
+    return impulses, _solve(_system(rows, delassus.whole(), impulses, by_group(rows, errors)), change)
 
 
 def _system(rows: tuple[Rows, ...], matrix: Array, impulses: Array, errors: tuple[Array, ...]) -> Array:

@@ -2,9 +2,8 @@
 
 An impulse on a link moves the whole tree. Swept in turn with the rows that hold, a contact finds the inertia of the tree
 only after as many sweeps as the tree is heavier than the link: a robot sinks through the ground on its light feet. Here the
-response of everything to each row is found first (`solver.tree`, all rows side by side as if they were worlds). What the
-sweeps then act on is not the velocities of bodies but the rates of the rows, one block of as many components as there are
-rows: the Jacobian of a row picks its own rate, its response is its column of the matrix ``J M^-1 J^T`` with the joints held.
+matrix ``J M^-1 J^T`` of all rows with the joints held is found first (`solver.delassus`). What the sweeps then act on is not
+the velocities of bodies, but generalized impulses of the mechanisms, or the rates of the rows where these are fewer.
 """
 
 from __future__ import annotations
@@ -19,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints import contact, mechanism_links, row_sides
+from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
+from mathota_jax.constraints import contact, mechanism, mechanism_coordinates, mechanism_links, row_sides
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
 from mathota_jax.constraints.mechanism_layout import bounded_slots, contact_places
@@ -27,13 +27,15 @@ from mathota_jax.constraints.mechanism_rows import of_slots, respond, to_tables,
 from mathota_jax.constraints.touching import Touching, touching
 from mathota_jax.scene import Scene
 from mathota_jax.solver import pgs
+from mathota_jax.solver.delassus import Delassus, Factored, Whole
 from mathota_jax.solver.laws import Bounded, Cone
-from mathota_jax.solver.row_matrix import Entries, Picked
+from mathota_jax.solver.row_matrix import Dense, Entries
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY, Table, TracedTable
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.spread import add_scaled, add_slices
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_slices
 
 LARGEST_STEP = 1.9
 """Bound of the eigenvalues of the matrix of a constraint times its steps; sweeps diverge at 2."""
@@ -60,24 +62,39 @@ class Reduced(NamedTuple):
     """The rows of a step, reduced.
 
     Attributes:
+      links: the mechanisms at the pose at which the rows act.
+      inertia: of the moving bodies.
       sides: the rows on single bodies.
-      velocity: (component, block, row, world) under a unit impulse of each row, with the joints held.
-      matrix: (row, row, world) what a unit impulse of the second does to the rate of the first.
+      delassus: ``J M^-1 J^T`` of the rows with the joints held, without derivative.
       rows: one group for the rows with bounds on joints, if there are any, then one for each class of each contact table.
       close: the last of these, of contacts that have places, as they act on single bodies; None if all have rows.
       touching: which these are.
     """
 
+    links: mechanism_links.Links
+    inertia: Inertia
     sides: row_sides.RowSides
-    velocity: Array
-    matrix: Array
+    delassus: Delassus
     rows: tuple[Rows, ...]
     close: Rows | None = None
     touching: Touching | None = None
 
     def rates(self, velocity: Array) -> Array:
-        """Rates (row, 1, world) of the velocities (component, block, world)."""
-        return self.sides.rates(velocity[:, :, None])
+        """Rates (row, world) of the velocities (component, block, world)."""
+        return self.sides.rates(velocity[:, :, None])[:, 0]
+
+    def change(self, impulses: Array) -> Array:
+        """Velocities (component, block, world) that impulses (row, world) change, with the joints held."""
+        layout = self.links.layout
+        force = self.sides.push(impulses, layout.block_count)
+        force = compute_once(force, force)
+        moved = mechanism.respond(self.links, force)
+        if len(layout.links) == layout.block_count:
+            return moved
+        linear, angular = unpack_blocks(force)
+        assert angular is not None
+        alone = pack_blocks(linear * self.inertia.inverse_mass, self.inertia.solve(angular))
+        return jnp.where(np.isin(np.arange(layout.block_count), layout.blocks)[:, None], moved, alone)
 
     def contacts(self, groups: Sequence[Rows]) -> list[Rows]:
         """Those of all contacts that have places here, with laws and biases of `groups`: laws of all contacts."""
@@ -94,13 +111,13 @@ class Reduced(NamedTuple):
         groups = (dataclasses.replace(mine, bias=bias) for mine, bias in zip(self.rows[count:], biases, strict=True))
         return self._replace(rows=(*self.rows[:count], *groups))
 
-    def change(self, impulses: Sequence[Array]) -> Array:
-        """What impulses of the reduced groups change, with the joints held; (component, block, world)."""
-        return change(self.velocity, impulses)
-
 
 def reduce(
-    scene: Scene, links: mechanism_links.Links, joint_rows: Sequence[Rows], groups: Sequence[ContactRows]
+    scene: Scene,
+    links: mechanism_links.Links,
+    inertia: Inertia,
+    joint_rows: Sequence[Rows],
+    groups: Sequence[ContactRows],
 ) -> Reduced:
     """The rows of a scene whose mechanisms take contacts, from those that act on single bodies."""
     contacts = [group.rows for group in groups]
@@ -115,13 +132,22 @@ def reduce(
         found = touching(traced, room.count, room.points)
         close = found.rows([group.rows for group in traced])
         sides, contacts = sides._replace(traced=row_sides.traced_sides(close, worlds)), [*contacts, close]
-    velocity, matrix = respond(links, sides, worlds)
+    delassus = lax.stop_gradient(_delassus(links, inertia, sides, worlds))
     bounded = bounded_slots(scene)
     rows, first = [], len(bounded)
     if bounded:
-        rows.append(_joint_group(joint_rows, bounded, matrix))
-    rows += contact_groups(contacts, matrix, first)
-    return Reduced(sides, velocity, matrix, tuple(rows), close, found)
+        rows.append(_joint_group(joint_rows, bounded, delassus))
+    rows += contact_groups(contacts, delassus, first)
+    return Reduced(links, inertia, sides, delassus, tuple(rows), close, found)
+
+
+def _delassus(links: mechanism_links.Links, inertia: Inertia, sides: row_sides.RowSides, worlds: int) -> Delassus:
+    """In the smaller form."""
+    if mechanism_coordinates.coordinate_count(links.layout) >= sides.count:
+        return Whole(respond(links, sides, worlds)[1])
+    rates = sides.rates(mechanism_coordinates.responses(links, inertia, worlds))
+    forces = sides.rates(mechanism_coordinates.motions(links, worlds))
+    return Factored(compute_once(rates, rates), compute_once(forces, forces))
 
 
 def to_reduced(
@@ -168,24 +194,60 @@ def from_reduced(
     return (*joints, *_by_turn(_fixed_tables(scene), own), *close)
 
 
-def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows, ...], Array]:
-    """Groups for the normals of the contacts alone, with the biases of `contacts`; the velocity under a unit impulse."""
+def normal_rows(reduced: Reduced, contacts: Sequence[Rows]) -> tuple[tuple[Rows, ...], Array, np.ndarray]:
+    """Groups for the normals of the contacts alone, with the biases of `contacts`.
+
+    Also what their sweeps act on, at rest, and their numbers among all rows.
+    """
     contacts = reduced.contacts(contacts)
     groups = reduced.rows[len(reduced.rows) - sum(len(_classes(group.table)) for group in contacts) :]
-    first = len(reduced.matrix) - sum(group.bias[..., 0].size for group in groups)
+    first = reduced.delassus.count - sum(group.bias[..., 0].size for group in groups)
     numbers = []
     for group in groups:
         turns, rows, points = group.bias.shape[:3]
         numbers.append(first + np.arange(turns * rows * points).reshape(turns, points, rows)[:, :, 0].reshape(-1))
         first += turns * rows * points
     chosen = np.concatenate(numbers)
-    matrix = reduced.matrix[chosen][:, chosen]
-    return tuple(contact_groups(contacts, matrix, 0)), reduced.velocity[:, :, chosen]
+    of_normals = reduced.delassus.chosen(chosen)
+    rows = tuple(contact_groups(contacts, of_normals, 0))
+    return rows, at_rest(of_normals, max(group.bias.shape[-1] for group in rows)), chosen
 
 
-def change(velocity: Array, impulses: Sequence[Array]) -> Array:
-    """(component, block, world) from those under unit impulses of rows (component, block, row, world), and impulses."""
-    return add_scaled(velocity, in_order(impulses))
+def at_rest(delassus: Delassus, worlds: int) -> Array:
+    """What sweeps act on, (component, 1, world), without impulses and rates."""
+    like = jax.tree.leaves(delassus)[0]
+    return jnp.zeros((delassus.size, 1, worlds), like.dtype)
+
+
+def with_rates(groups: Sequence[Rows], delassus: Delassus, rates: Array) -> tuple[tuple[Rows, ...], Array]:
+    """Groups, and what their sweeps act on, where the rates (row, world) are some without impulses.
+
+    Not as biases, by which sweeps know what bounces: generalized impulses get a component more, which is 1 throughout.
+    """
+    if isinstance(delassus, Whole):
+        return tuple(groups), rates[:, None]
+    found = []
+    for group, more in zip(groups, by_group(groups, rates), strict=True):
+        dense = group.matrix.dense()
+        (jacobian,), (response,) = dense.jacobian, dense.response
+        jacobian = jnp.concatenate(in_every_world([jacobian, more[:, :, None]], rates.shape[-1]), axis=2)
+        response = jnp.concatenate([response, jnp.zeros_like(response[:, :, :1])], axis=2)
+        found.append(dataclasses.replace(group, matrix=Dense((jacobian,), (response,))))
+    still = at_rest(delassus, rates.shape[-1])
+    return tuple(found), jnp.concatenate([still, jnp.ones_like(still[:1])])
+
+
+def scattered(values: Array, rows: np.ndarray, count: int) -> Array:
+    """Values (row, world) of all rows, from those of some; 0 for others."""
+    place = np.full(count, len(rows))
+    place[rows] = np.arange(len(rows))
+    return take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), place)
+
+
+def with_errors(groups: Sequence[Rows], errors: Array) -> tuple[Rows, ...]:
+    """The groups with the errors (row, world) added to their biases, in the order of their rows."""
+    parts = zip(groups, by_group(groups, errors), strict=True)
+    return tuple(dataclasses.replace(group, bias=group.bias + error) for group, error in parts)
 
 
 def _fixed_tables(scene: Scene) -> tuple[Table, ...]:
@@ -206,17 +268,10 @@ def _places(scene: Scene, joint_rows: Sequence[Rows], contacts: Sequence[Rows]) 
     return np.concatenate(parts)
 
 
-def _group(table: Table, law: Bounded | Cone, bias: Array, matrix: Array, first: int) -> Rows:
+def _group(table: Table, law: Bounded | Cone, bias: Array, delassus: Delassus, first: int) -> Rows:
     """Rows that start at `first`, one constraint a turn."""
     turns, rows, points = bias.shape[:3]
-    count = len(matrix)
-
-    def by_turn(values: Array) -> Array:
-        chosen = values[:, first : first + turns * rows * points]
-        return chosen.reshape(count, turns, points, rows, -1).transpose(1, 3, 0, 2, 4)
-
-    starts = first + rows * points * np.arange(turns, dtype=np.int32)[:, None]
-    return Rows(Picked(by_turn(matrix), jnp.asarray(starts)), bias, law, table)  # type: ignore[arg-type]
+    return Rows(delassus.turns(first, turns, points, rows), bias, law, table)  # type: ignore[arg-type]
 
 
 def _one_a_turn(turns: int, points: int) -> Table:
@@ -224,35 +279,34 @@ def _one_a_turn(turns: int, points: int) -> Table:
     return Table(slots, (((0,) * points,) * turns,), 1, points)
 
 
-def _joint_group(joint_rows: Sequence[Rows], bounded: tuple[int, ...], matrix: Array) -> Rows:
+def _joint_group(joint_rows: Sequence[Rows], bounded: tuple[int, ...], delassus: Delassus) -> Rows:
     law = jax.tree.map(lambda *parts: of_slots(joint_rows, bounded, parts), *(group.law for group in joint_rows))
-    return scalar_group(law, of_slots(joint_rows, bounded, [group.bias for group in joint_rows]), matrix)
+    return scalar_group(law, of_slots(joint_rows, bounded, [group.bias for group in joint_rows]), delassus)
 
 
-def scalar_group(law: Bounded, bias: Array, matrix: Array) -> Rows:
-    """The first rows of a matrix, one after the other; law and bias (row, world), the masses those of two bodies alone."""
-    law = with_tree(matrix, law, len(bias))
+def scalar_group(law: Bounded, bias: Array, delassus: Delassus) -> Rows:
+    """The first rows, one after the other; law and bias (row, world), the masses those of two bodies alone."""
+    law = with_tree(delassus.diagonal(len(bias)), law)
     law, bias = jax.tree.map(lambda x: jnp.broadcast_to(x, law.softness.shape)[:, None, None], (law, bias))
-    return _group(_one_a_turn(len(bias), 1), law, bias, matrix, 0)
+    return _group(_one_a_turn(len(bias), 1), law, bias, delassus, 0)
 
 
-def contact_groups(contacts: Sequence[Rows], matrix: Array, first: int) -> list[Rows]:
+def contact_groups(contacts: Sequence[Rows], delassus: Delassus, first: int) -> list[Rows]:
     """The groups of all contacts, whose rows start at `first`."""
     found = []
     for group in contacts:
         for members in _classes(group.table):
-            found.append(_contact_group(group, members, matrix, first))
+            found.append(_contact_group(group, members, delassus, first))
             first += found[-1].bias[..., 0].size
     return found
 
 
-def _contact_group(group: Rows, members: _Class, matrix: Array, first: int) -> Rows:
+def _contact_group(group: Rows, members: _Class, delassus: Delassus, first: int) -> Rows:
     bias = _of_class(group.table, members, group.bias)
     turns, rows, points = bias.shape[:3]
     size = rows * points
-    starts = [first + size * turn for turn in range(turns)]
-    own = jnp.stack([matrix[start : start + size, start : start + size] for start in starts])
-    own = lax.stop_gradient(own).reshape(turns, size, points, rows, -1)
+    own = delassus.blocks(first, turns, size)
+    own = compute_once(own, own).reshape(turns, size, points, rows, -1)
 
     def of_points(values: Array) -> Array:
         return _of_class(group.table, members, values[:, None])[:, 0]
@@ -263,12 +317,12 @@ def _contact_group(group: Rows, members: _Class, matrix: Array, first: int) -> R
     entries = _entries(own)
     normal = safe_divide(active, normal_bound(entries, points, active))
     if not isinstance(law, Cone):
-        return _group(_one_a_turn(turns, points), contact.push_only(normal[:, None]), bias, matrix, first)
+        return _group(_one_a_turn(turns, points), contact.push_only(normal[:, None]), bias, delassus, first)
     tangent = safe_divide(active, tangent_bound(entries, points, active))
     share = _convergent(own, normal, tangent, active)
     grip = None if law.first_grip is None else of_points(law.first_grip)
     law = Cone(normal * share, tangent * share, of_points(law.friction), grip)
-    return _group(_one_a_turn(turns, points), law, bias, matrix, first)
+    return _group(_one_a_turn(turns, points), law, bias, delassus, first)
 
 
 def _entries(own: Array) -> tuple[Entries, Entries]:

@@ -19,6 +19,7 @@ from jax import Array, lax
 
 from mathota_jax.constraints.joints.rows import ELASTIC, SERVO, VISCOUS
 from mathota_jax.solver import dense
+from mathota_jax.solver.delassus import Delassus
 from mathota_jax.solver.laws import Bounded
 from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.settle import settle
@@ -39,7 +40,7 @@ def are_stiff(laws: np.ndarray) -> bool:
 def closer_start(
     laws: np.ndarray,
     law: Bounded,
-    matrix: Array,
+    delassus: Delassus,
     errors: Array,
     impulses: Array,
     sweep: Callable[[Elimination, Array], Array],
@@ -53,17 +54,17 @@ def closer_start(
     Args:
       laws: static names of the laws of the first rows, which are scalar; some are stiff.
       law: their coefficients (row, world).
-      matrix: (row, row, world) of all rows.
+      delassus: of all rows.
       errors: (row, world) rates without impulses, of scalar rows with their biases.
       impulses: (row, world) of the last step; what was at its bound is taken to stay there at first.
       sweep: gives the impulses of the rows that an elimination leaves, from some to start from.
       left_to_do: energy (world,) of what one more update of each row alone would change.
     """
-    worlds = max(leaf.shape[-1] for leaf in (matrix, errors, impulses, *jax.tree.leaves(law)))
-    law, matrix, errors, impulses = in_every_world((law, matrix, errors, impulses), worlds)
+    worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((delassus, errors, impulses, law)))
+    law, delassus, errors, impulses = in_every_world((law, delassus, errors, impulses), worlds)
 
     def solve_all(before: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
-        found = _eliminate(laws, law, matrix, errors, before[0])
+        found = _eliminate(laws, law, delassus, errors, before[0])
         others = take(impulses, found.left)
         return found.impulses(before[0], sweep(found, others) if len(found.left) else others), None
 
@@ -79,7 +80,7 @@ class Elimination(NamedTuple):
 
     Attributes:
       soft, left: static places of these rows, and of all others.
-      matrix: (row, row, world) what a unit impulse of the second of the others does to the rate of the first.
+      delassus: of the others.
       errors: (row, world) of the others, without impulses of their own.
       alone: (row, world) impulses of the eliminated rows without the others.
       by_left: (row, row, world) what a unit impulse of one of the others (second) takes from them.
@@ -89,7 +90,7 @@ class Elimination(NamedTuple):
 
     soft: np.ndarray
     left: np.ndarray
-    matrix: Array
+    delassus: Delassus
     errors: Array
     alone: Array
     by_left: Array
@@ -109,28 +110,23 @@ class Elimination(NamedTuple):
         return take(jnp.concatenate([pushes, of_left]), place), 1.0 - met.max(0)
 
 
-def _eliminate(laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, old: Array) -> Elimination:
+def _eliminate(laws: np.ndarray, law: Bounded, delassus: Delassus, errors: Array, old: Array) -> Elimination:
     """Eliminates springs, dampers and servos; arguments as for `closer_start`, what is at its bound in `old` stays there."""
     linear = np.isin(laws, LINEAR)
-    soft, left = np.flatnonzero(linear), np.concatenate([np.flatnonzero(~linear), np.arange(len(laws), len(matrix))])
+    soft = np.flatnonzero(linear)
+    left = np.concatenate([np.flatnonzero(~linear), np.arange(len(laws), delassus.count)])
     law, pushes = take((law, old), soft)
     bounds = law.lower, law.upper
     inside = (law.effective_mass > 0) & (pushes < law.upper) & (pushes > law.lower)
     free = settle(jnp.where(inside, 1.0, 0.0).astype(errors.dtype))
-    rows = take(matrix, soft)
-    errors = errors + add_scaled(take(matrix, soft, axis=1), pushes * (1.0 - free))
-    unit = jnp.eye(len(soft), dtype=matrix.dtype)[..., None]
-    system = take(rows, soft, axis=1) * free * free[:, None] + unit * (law.softness * free + 1.0 - free)
-    given = jnp.concatenate([take(rows, left, axis=1), take(errors, soft)[:, None]], axis=1) * free[:, None]
+    errors = errors + delassus.times(pushes * (1.0 - free), soft)
+    unit = jnp.eye(len(soft), dtype=errors.dtype)[..., None]
+    system = delassus.part(soft, soft) * free * free[:, None] + unit * (law.softness * free + 1.0 - free)
+    of_left = [delassus.part(soft, left)] if len(left) else []
+    given = jnp.concatenate([*of_left, take(errors, soft)[:, None]], axis=1) * free[:, None]
     answers = dense.solve(system[None], given[None])[0]
     by_left, alone = answers[:, :-1], -answers[:, -1]
     if not len(left):
-        return Elimination(soft, left, matrix[:0, :0], errors[:0], alone, by_left, free, bounds)
-    across = take(take(matrix, left), soft, axis=1)
-
-    def without(kept: Array, row: tuple[Array, Array]) -> tuple[Array, None]:
-        column, answer = row
-        return kept - column[:, None] * answer, None
-
-    kept = lax.scan(without, take(take(matrix, left), left, axis=1), (jnp.swapaxes(across, 0, 1), by_left))[0]
-    return Elimination(soft, left, kept, take(errors, left) + add_scaled(across, alone), alone, by_left, free, bounds)
+        return Elimination(soft, left, delassus, errors[:0], alone, by_left, free, bounds)
+    kept = delassus.without(soft, left, by_left)
+    return Elimination(soft, left, kept, take(errors + delassus.times(alone, soft), left), alone, by_left, free, bounds)

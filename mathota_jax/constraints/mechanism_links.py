@@ -216,7 +216,7 @@ def push(links: Links, impulses: Impulses) -> Array:
         torque = torque + direction * impulse
     force, torque = store_cotangents(_stored(links, force, torque))
     carried = torque + cross(links.offset, force)
-    force, torque = force - _to_parents(links.layout, force), torque - _to_parents(links.layout, carried)
+    force, torque = force - to_parents(links.layout, force), torque - to_parents(links.layout, carried)
     if links.loops is not None:
         force, torque = map(operator.add, (force, torque), mechanism_loops.forces(links.loops, impulses[6]))
     return to_blocks(links.layout, pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque)))
@@ -259,7 +259,7 @@ def _of_parents(found: Layout, values: Any) -> Any:
     return jax.tree.map(lambda x: take(jnp.concatenate([jnp.zeros_like(x[:1]), x]), places), values)
 
 
-def _to_parents(found: Layout, values: Any) -> Any:
+def to_parents(found: Layout, values: Any) -> Any:
     """Sums over the children of all links."""
     parents = np.array([link.parent for link in found.links])
     if (parents == np.arange(len(parents)) - 1).all():

@@ -22,6 +22,7 @@ from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.solver import bounded_rows
+from mathota_jax.solver.delassus import Whole
 from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
@@ -81,7 +82,11 @@ def own_mass(matrix: Array, alone: Array, rows: Any) -> Array:
     """``J M^-1 J^T`` of `rows` with the tree; `alone`: with their two bodies, (row, world), which allow more motion."""
     rows = np.asarray(rows)
     first = rows.max() + 1
-    own = take(diagonal(matrix[:first, :first]), rows)
+    return felt_mass(take(diagonal(matrix[:first, :first]), rows), alone)
+
+
+def felt_mass(own: Array, alone: Array) -> Array:
+    """``J M^-1 J^T`` of rows (row, world) with the tree, not less than round-off leaves of that of two bodies alone."""
     return jnp.maximum(own, STIFF * jnp.finfo(own.dtype).eps * alone)
 
 
@@ -118,26 +123,29 @@ def solve(
     laws = joints.laws[np.asarray(slots)]
     if mechanism_drives.are_stiff(laws):
         without = error - add_scaled(responses.matrix, old)
-        first = _closer_start(sweeps, laws, *lax.stop_gradient((law, responses.matrix, without, first)))
-    law = with_tree(responses.matrix, law, len(slots))
+        first = _closer_start(sweeps, laws, *lax.stop_gradient((law, Whole(responses.matrix), without, first)))
+    law = with_tree(diagonal(responses.matrix), law)
     change = bounded_rows.solve(sweeps, responses.matrix, law, error, old, first) - old
     moved = velocity + add_scaled(responses.velocity, change)
     return moved, to_tables(joint_rows, slots, change)
 
 
-def _closer_start(sweeps: int, laws: np.ndarray, law: Bounded, matrix: Array, errors: Array, impulses: Array) -> Array:
+def _closer_start(
+    sweeps: int, laws: np.ndarray, law: Bounded, delassus: Whole, errors: Array, impulses: Array
+) -> Array:
     """Impulses (row, world) from which to sweep over all rows, see `mechanism_drives`; `errors` are without any."""
-    alone = with_tree(matrix, law, len(matrix))
+    alone = with_tree(delassus.diagonal(delassus.count), law)
 
     def sweep(found: mechanism_drives.Elimination, start: Array) -> Array:
-        left = with_tree(found.matrix, take(law, found.left), len(found.left))
-        return bounded_rows.solve(sweeps, found.matrix, left, found.errors, jnp.zeros_like(start), start)
+        of_left = found.delassus
+        left = with_tree(of_left.diagonal(of_left.count), take(law, found.left))
+        return bounded_rows.solve(sweeps, of_left.whole(), left, found.errors, jnp.zeros_like(start), start)
 
     def left_to_do(impulses: Array) -> Array:
-        change = alone.update(impulses, errors + add_scaled(matrix, impulses)) - impulses
+        change = alone.update(impulses, errors + delassus.times(impulses)) - impulses
         return safe_divide(change * change, jnp.broadcast_to(alone.effective_mass, change.shape)).sum(0)
 
-    return mechanism_drives.closer_start(laws, law, matrix, errors, impulses, sweep, left_to_do)
+    return mechanism_drives.closer_start(laws, law, delassus, errors, impulses, sweep, left_to_do)
 
 
 def has_stops(slots: tuple[int, ...], joints: JointRows) -> bool:
@@ -170,7 +178,7 @@ def leave_stops(
     nothing = jnp.zeros((len(stops), worlds), error.dtype)
     masses = [group.law.effective_mass for group in joint_rows if isinstance(group.law, Bounded)]
     alone = of_slots(joint_rows, tuple(np.asarray(slots)[stops]), masses)
-    law = with_tree(matrix, Bounded(alone, nothing, nothing, nothing + jnp.inf), len(stops))
+    law = with_tree(diagonal(matrix), Bounded(alone, nothing, nothing, nothing + jnp.inf))
     pushes = bounded_rows.solve(sweeps, matrix, law, error, nothing, nothing)
     return add_scaled(responses.velocity[:, :, stops], pushes)
 
@@ -195,9 +203,9 @@ def _slot_count(joint_rows: Sequence[Rows]) -> int:
     return sum(int((group.table.order != EMPTY).sum()) for group in joint_rows)
 
 
-def with_tree(matrix: Array, law: Bounded, count: int) -> Bounded:
-    """The laws of the first rows (row, world), which are those of two bodies alone, with all that hangs on them."""
+def with_tree(own: Array, law: Bounded) -> Bounded:
+    """Laws (row, world) that are those of two bodies alone, with all that hangs on them: `own` is the matrix's diagonal."""
     works = law.effective_mass > 0
-    own = own_mass(matrix, 1.0 / jnp.where(works, law.effective_mass, 1.0), range(count))
+    own = felt_mass(own, 1.0 / jnp.where(works, law.effective_mass, 1.0))
     mass = lax.stop_gradient(jnp.where(works, 1.0 / (own + law.softness), 0.0))
     return jax.tree.map(lambda x: jnp.broadcast_to(x, mass.shape), dataclasses.replace(law, effective_mass=mass))

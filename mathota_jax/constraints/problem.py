@@ -164,7 +164,7 @@ def constrain(
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
     reduced = None
     if held is not None and mechanism_layout.takes_contacts(scene):
-        reduced = mechanism_contacts.reduce(scene, held, tables, contact_rows)
+        reduced = mechanism_contacts.reduce(scene, held, inertia, tables, contact_rows)
     return Problem(
         joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings, offsets, reduced
     )

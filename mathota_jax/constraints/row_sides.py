@@ -17,7 +17,7 @@ from jax import Array
 from mathota_jax.solver.rows import Rows
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.settle import store
-from mathota_jax.spatial.spread import add_slices, spread
+from mathota_jax.spatial.spread import add_scaled, add_slices, spread
 
 
 class FixedSide(NamedTuple):
@@ -50,6 +50,17 @@ class FixedSide(NamedTuple):
             shape = (len(jacobian), len(rows), *at_blocks[block].shape[1:])
             found.append(add_slices(spread(jacobian[:, :, None], shape) * spread(at_blocks[block][:, None], shape), 0))
         return take(jnp.concatenate(found), np.argsort(np.concatenate(order)))
+
+    def push(self, impulses: Array, block_count: int) -> Array:
+        """Impulses (component, block, world) on the bodies by those of the rows (row, world)."""
+        blocks, found = np.asarray(self.blocks), []
+        for block in range(block_count):
+            rows = np.flatnonzero(blocks == block)
+            if len(rows):
+                found.append(add_scaled(take(self.jacobian, rows, axis=1), take(impulses, rows)))
+            else:
+                found.append(jnp.zeros((len(self.jacobian), impulses.shape[-1]), impulses.dtype))
+        return jnp.stack(found, axis=1)
 
 
 class TracedSide(NamedTuple):
@@ -92,6 +103,15 @@ class TracedSide(NamedTuple):
         products = spread(jacobian[:, :, :, None], shape) * spread(velocities[:, :, None], shape)
         return add_slices(products, 0).reshape(-1, columns, worlds)
 
+    def push(self, impulses: Array, block_count: int) -> Array:
+        """As of a `FixedSide`."""
+        components, _, worlds = self.jacobian.shape
+        jacobian = self.jacobian.reshape(components, len(self.blocks), -1, worlds)
+        of_rows = impulses.reshape(1, len(self.blocks), -1, worlds)
+        of_constraints = add_slices(jacobian * spread(of_rows, jacobian.shape), 2)
+        of_constraints = store(of_constraints, of_constraints)
+        return jnp.stack([add_scaled(of_constraints, self._at(block)) for block in range(block_count)], axis=1)
+
 
 class RowSides(NamedTuple):
     """Both sides of all rows: those at blocks that are fixed, then those at traced ones."""
@@ -103,6 +123,17 @@ class RowSides(NamedTuple):
     def fixed_count(self) -> int:
         """Number of rows at fixed blocks."""
         return len(self.fixed[0].blocks)
+
+    @property
+    def count(self) -> int:
+        """Number of all rows."""
+        return self.fixed_count + (self.traced[0].jacobian.shape[1] if self.traced else 0)
+
+    def push(self, impulses: Array, block_count: int) -> Array:
+        """Impulses (component, block, world) on the bodies by those of the rows (row, world)."""
+        parts = (impulses[: self.fixed_count], impulses[self.fixed_count :])
+        pairs = [(side, part) for sides, part in zip((self.fixed, self.traced), parts, strict=True) for side in sides]
+        return functools.reduce(jnp.add, [side.push(part, block_count) for side, part in pairs if len(part)])
 
     def forces(self, block_count: int) -> Array:
         """Impulses (component, block, row, world) on the bodies by a unit impulse of each row."""

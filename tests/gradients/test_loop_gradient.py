@@ -34,6 +34,7 @@ def forward_mode():
     return np.asarray(jax.jit(jax.jacfwd(end))(jnp.array(START)))
 
 
+@pytest.mark.slow
 def test_forward_mode_is_central_differences(float64, gate):
     start = jnp.array(START)
     ends = jax.jit(jax.vmap(end))(jnp.concatenate([start + 1e-5 * jnp.eye(3), start - 1e-5 * jnp.eye(3)]))

@@ -349,7 +349,7 @@ def test_a_jointed_pair_that_hits_a_wall_gains_no_energy(float64, gate, settings
     gate("energy / that at first - 1", np.maximum(energy - 1, 0.0), 0.001)
 
 
-@pytest.mark.parametrize("settings", PAIRS)
+@pytest.mark.parametrize("settings", slow_but(("default",), PAIRS))
 def test_a_jointed_pair_that_hits_a_wall_closes_again(float64, gate, settings):
     _, opening = jointed_pairs(PAIRS[settings])
     gate("opening 0.7 s after the impact [m]", opening[-18:], 0.005)

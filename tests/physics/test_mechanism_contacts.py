@@ -89,6 +89,7 @@ def test_a_frictionless_leg_stands(gate):
     gate("moved [m]", np.asarray(stand(model, state).position - state.position, float), 1e-5)
 
 
+@pytest.mark.slow
 def test_a_leg_sleeps_and_wakes_as_a_whole(gate):
     builder = on_ground()
     bodies = leg(builder, (0.2, 10.0, 10.0))

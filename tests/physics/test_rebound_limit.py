@@ -14,6 +14,7 @@ import pytest
 
 from mathota_jax import Box, Distance, Fixed, Hinge, Plane, SceneBuilder, Sphere, contact_forces, energy, step
 from mathota_jax.constraints import mechanism_layout
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import advance_worlds, repeat, rotation_matrix, undamped
 
 BALL, DT, MASS = 2, 1 / 240, 2.0
@@ -50,6 +51,8 @@ def wedge(solver="pgs", walls=WALLS, carried=(), roped=False, **options):
     ],
     ids=["pgs", "converged", "welded", "welded, beside a broadphase", "welded and swept"],
 )
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.filterwarnings("ignore:build")
 def test_energy_is_kept(precision, gate, solver, carried, options):
     model, state = wedge(solver, carried=carried, **options)
     assert mechanism_layout.takes_contacts(model.scene) == bool(carried and "roped" not in options)

@@ -155,7 +155,8 @@ def test_small_motion_is_that_of_the_modes(float64, gate):
     gate("error at half the step / a quarter - 1", 4 * errors[1] / errors[0] - 1, 0.1)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivative_of_what_bears_the_arm(float64, mode, gate):
     """By the stiffness of the servos; the linear statics have -angle / stiffness."""
     model, state = arm("servo", 1 / 60)

@@ -35,7 +35,7 @@ def takes_contacts(model):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("ground", [pytest.param("plane", marks=pytest.mark.slow), "slab"])
+@pytest.mark.parametrize("ground", ["plane", pytest.param("slab", marks=pytest.mark.slow)])
 def test_a_leg_carries_a_free_ball(precision, ground, gate):
     """Foot on the ground, ball on a plate: pairs of one moving body and of two, of one point and of four."""
     builder = {"plane": on_ground, "slab": on_slab}[ground]()
@@ -123,7 +123,8 @@ def test_pincers_press_with_the_torque_of_their_motors(precision, gate):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("tiles", [0, pytest.param(25, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("tiles", [0, 25])
 def test_a_robot_that_may_touch_itself_stands(precision, tiles, gate):
     """It fell on its belly in a second: 36 pairs get a broadphase, where contacts were swept in turn with the joints."""
     model, state = quadruped("servo", undamped(dt=1 / 60), ignores_itself=tiles > 0, tiles=tiles)

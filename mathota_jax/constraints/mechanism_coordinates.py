@@ -1,0 +1,110 @@
+"""Coordinates of mechanisms: the ways in which their joints, and bodies without any, can move.
+
+A link has one for each of its six rows that is not held: the rate along that row while the rates along its others are 0.
+All is about the centres of mass, and without derivatives.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+
+from mathota_jax.bodies import Inertia, pack_blocks
+from mathota_jax.constraints import mechanism
+from mathota_jax.constraints.mechanism_layout import Layout
+from mathota_jax.constraints.mechanism_links import Links, pack, shift_of_turn, to_blocks, to_parents, unpack
+from mathota_jax.solver import tree
+from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import repeat_worlds
+from mathota_jax.spatial.vector import Vec3, cross
+
+
+def coordinate_count(found: Layout) -> int:
+    """Number of coordinates."""
+    return int((~found.held).sum()) + 6 * (found.block_count - len(found.links))
+
+
+def motions(links: Links, worlds: int) -> Array:
+    """Velocities (component, block, coordinate, world) at unit rates of the coordinates."""
+    links = lax.stop_gradient(links)
+    rows, of_links = _rows(links.layout)
+    count = len(of_links)
+    shifts = links.duals[0]
+    turns = tuple(shift_of_turn(links.translations, shifts, turn) for turn in links.duals[1])
+    nothing = [dual * 0.0 for dual in shifts]
+    shift = _select(rows, (*shifts, *turns), worlds)
+    turn = _select(rows, (*nothing, *links.duals[1]), worlds)
+    offset = repeat_worlds(links.factors.offset, count, worlds)
+    shift, turn = (vector.map(lambda x: x.reshape(len(x), -1)) for vector in (shift, turn))
+    linear, angular = unpack(tree.follow(links.layout.tree, offset, pack(shift, turn)))
+    moved = to_blocks(links.layout, pack_blocks(linear, angular))
+    moved = moved.reshape(*moved.shape[:2], count, -1)
+    unit = jnp.eye(6, dtype=moved.dtype)[:, None, :, None]
+    alone = _alone(links.layout, jnp.broadcast_to(unit, (6, moved.shape[1], 6, worlds)))
+    return jnp.concatenate([moved, alone], axis=2)
+
+
+def responses(links: Links, inertia: Inertia, worlds: int) -> Array:
+    """Velocities (component, block, coordinate, world) under unit generalized impulses, with the joints held."""
+    links, inertia = lax.stop_gradient((links, inertia))
+    rows, of_links = _rows(links.layout)
+    count = len(of_links)
+    nothing = links.offset * 0.0
+    sides = links.translations
+    force = _select(rows, (*(side.linear for side in sides), nothing, nothing, nothing), worlds)
+    torque = _select(rows, (*(side.angular for side in sides), *links.rotations), worlds)  # type: ignore[arg-type]
+    carried = torque + cross(links.offset.map(lambda x: x[:, None]), force)
+    force, torque = force - to_parents(links.layout, force), torque - to_parents(links.layout, carried)
+    flat = pack_blocks(force, torque)
+    flat = to_blocks(links.layout, flat.reshape(*flat.shape[:2], -1))
+    tiled = repeat_worlds(links, count, worlds)
+    moved = mechanism.respond(tiled, compute_once(flat, flat))
+    moved = moved.reshape(*moved.shape[:2], count, -1)
+    return jnp.concatenate([moved, _alone(links.layout, _inverse(inertia, worlds))], axis=2)
+
+
+def _rows(found: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """(6, link, coordinate) whether a coordinate of the links is along a row; the link of each."""
+    row, link = np.nonzero(~found.held)
+    order = np.argsort(link, kind="stable")
+    row, link = row[order], link[order]
+    here = (np.arange(6)[:, None, None] == row) & (np.arange(len(found.links))[:, None] == link)
+    return here, link
+
+
+def _select(rows: np.ndarray, of_rows: tuple[Vec3, ...], worlds: int) -> Vec3:
+    """(link, coordinate, world) of the row that each coordinate is along, 0 elsewhere."""
+    total = Vec3(*(jnp.zeros((*rows.shape[1:], worlds), of_rows[0].x.dtype) for _ in range(3)))
+    for here, vector in zip(rows, of_rows, strict=True):
+        if here.any():
+            total = jax.tree.map(
+                lambda own, new, here=here[..., None]: jnp.where(here, new[:, None], own), total, vector
+            )
+    return total
+
+
+def _alone(found: Layout, values: Array) -> Array:
+    """(component, block, coordinate, world) of bodies without joints, from (component, block, component, world)."""
+    free = [block for block in range(found.block_count) if block not in found.blocks]
+    of_block, component = np.repeat(free, 6).astype(int), np.tile(np.arange(6), len(free))
+    here = np.arange(found.block_count)[:, None] == of_block
+    return jnp.where(here[..., None], values[:, :, component], 0.0)
+
+
+def _inverse(inertia: Inertia, worlds: int) -> Array:
+    """(component, block, component, world) inverse of the inertia of each body."""
+    inverse = inertia.inverse()
+    zero = jnp.zeros((len(inertia.inverse_mass), worlds), inertia.inverse_mass.dtype)
+    mass, (x, y, z) = inverse.inverse_mass, inverse.diagonal
+    yz, xz, xy = (zero, zero, zero) if inverse.products is None else inverse.products
+    rows = [
+        [mass, zero, zero, zero, zero, zero],
+        [zero, mass, zero, zero, zero, zero],
+        [zero, zero, mass, zero, zero, zero],
+        [zero, zero, zero, x, xy, xz],
+        [zero, zero, zero, xy, y, yz],
+        [zero, zero, zero, xz, yz, z],
+    ]
+    return jnp.stack([jnp.stack([entry + zero for entry in row], axis=1) for row in rows])
