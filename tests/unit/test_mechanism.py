@@ -9,7 +9,7 @@ import pytest
 
 from mathota_jax import BallAndSocket, Box, Distance, Fixed, Hinge, SceneBuilder, Slider, Sphere
 from mathota_jax.bodies import moving, moving_inertia, unpack
-from mathota_jax.constraints import mechanism, mechanism_links
+from mathota_jax.constraints import mechanism, mechanism_coordinates, mechanism_links
 from mathota_jax.constraints.joint_rows import joint_rows
 from mathota_jax.constraints.mechanism_layout import covers, layout
 from tests.scenes import undamped
@@ -17,12 +17,12 @@ from tests.scenes import undamped
 ANCHOR, AXIS = (0.3, 0.2, 0.1), (0.2, 0.5, 1.0)
 
 
-def joined(kinds, parents, grounded, reverse=()):
-    """Boxes of unlike masses, body 1 on the ground or free; joint k leads to body k + 2 from `parents[k]`."""
+def joined(kinds, parents, grounded, reverse=(), alone=0):
+    """Boxes of unlike masses, body 1 on the ground or free; joint k leads to body k + 2 from `parents[k]`, `alone` more."""
     generator = np.random.default_rng(len(kinds))
     builder = SceneBuilder()
     ground = builder.add_body(Sphere(0.1), static=True, collides=False)
-    for _ in range(len(kinds) + 1):
+    for _ in range(len(kinds) + 1 + alone):
         half = tuple(generator.uniform(0.05, 0.5, 3))
         place = tuple(generator.normal(size=3))
         builder.add_body(Box(half), mass=10 ** generator.uniform(-1, 1), position=place, collides=False)
@@ -103,9 +103,10 @@ def links_at(model, state):
     return mechanism_links.links(model.scene, joint_rows(model, bodies), blocks.position, inertia)
 
 
-def in_float64(case):
+def in_float64(case, built=None):
     return jax.tree.map(
-        lambda x: x.astype(jnp.result_type(float))[..., None] if x.dtype.kind == "f" else x[..., None], CASES[case]
+        lambda x: x.astype(jnp.result_type(float))[..., None] if x.dtype.kind == "f" else x[..., None],
+        built or CASES[case],
     )
 
 
@@ -127,6 +128,32 @@ def test_derivative_of_the_response_by_the_poses(float64, case, gate):
     slope = np.asarray(jax.jvp(motion, (jnp.asarray(0.0),), (jnp.asarray(1.0),))[1])
     quotient = np.asarray(motion(1e-5) - motion(-1e-5)) / 2e-5
     gate("slope - quotient, relative", (slope - quotient) / np.abs(quotient).max(), 1e-8)
+
+
+@pytest.mark.parametrize("case", ["all kinds", "branches", "beside two boxes"])
+def test_response_in_coordinates(float64, case, gate):
+    """Impulses on all bodies, as generalized ones times what these do; as many coordinates as ways to move."""
+    generator = np.random.default_rng(4)
+    model, state = (
+        in_float64(case) if case in CASES else in_float64(case, joined([Hinge, BallAndSocket], [1, 1], False, alone=2))
+    )
+    scene, bodies = model.scene, unpack(state)
+    blocks = moving(scene, bodies)
+    inertia = moving_inertia(scene, model, blocks.orientation)
+    links = links_at(model, state)
+    motions = np.asarray(mechanism_coordinates.motions(links, 1))[..., 0]
+    responses = np.asarray(mechanism_coordinates.responses(links, inertia, 1))[..., 0]
+    ways = {"all kinds": 1 + 3 + 1 + 0 + 5 + 1, "branches": 6 + 1 + 3 + 1 + 1 + 1 + 1, "beside two boxes": 6 + 4 + 12}
+    assert motions.shape[2] == mechanism_coordinates.coordinate_count(links.layout) == ways[case]
+    impulse = generator.normal(size=(6, len(scene.dynamic_bodies), 1))
+    found = np.einsum("cbq,q->cb", responses, np.einsum("cbq,cb->q", motions, impulse[..., 0]))
+    truth = np.array(mechanism.respond(links, jnp.asarray(impulse))[..., 0])
+    for block in set(range(len(scene.dynamic_bodies))) - set(links.layout.blocks):
+        body = scene.dynamic_bodies[block]
+        force, torque = impulse[:3, block, 0], impulse[3:, block, 0]
+        # These boxes are upright.
+        truth[:, block] = [*force / model.mass[body, 0], *torque / model.inertia[body, :, 0]]
+    gate("velocity", (found - truth) / np.abs(truth).max(), 1e-10)
 
 
 def test_worlds_that_differ_by_masses_alone(float64, gate):
