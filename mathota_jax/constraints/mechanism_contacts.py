@@ -143,7 +143,7 @@ def reduce(
 
 def _delassus(links: mechanism_links.Links, inertia: Inertia, sides: row_sides.RowSides, worlds: int) -> Delassus:
     """In the smaller form."""
-    if mechanism_coordinates.coordinate_count(links.layout) >= sides.count:
+    if not 0 < mechanism_coordinates.coordinate_count(links.layout) < sides.count:
         return Whole(respond(links, sides, worlds)[1])
     rates = sides.rates(mechanism_coordinates.responses(links, inertia, worlds))
     forces = sides.rates(mechanism_coordinates.motions(links, worlds))

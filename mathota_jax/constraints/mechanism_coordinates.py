@@ -29,8 +29,11 @@ def coordinate_count(found: Layout) -> int:
 def motions(links: Links, worlds: int) -> Array:
     """Velocities (component, block, coordinate, world) at unit rates of the coordinates."""
     links = lax.stop_gradient(links)
-    rows, of_links = _rows(links.layout)
-    count = len(of_links)
+    unit = jnp.eye(6, dtype=links.offset.x.dtype)[:, None, :, None]
+    alone = _alone(links.layout, jnp.broadcast_to(unit, (6, links.layout.block_count, 6, worlds)))
+    rows, count = _rows(links.layout)
+    if not count:
+        return alone
     shifts = links.duals[0]
     turns = tuple(shift_of_turn(links.translations, shifts, turn) for turn in links.duals[1])
     nothing = [dual * 0.0 for dual in shifts]
@@ -41,16 +44,16 @@ def motions(links: Links, worlds: int) -> Array:
     linear, angular = unpack(tree.follow(links.layout.tree, offset, pack(shift, turn)))
     moved = to_blocks(links.layout, pack_blocks(linear, angular))
     moved = moved.reshape(*moved.shape[:2], count, -1)
-    unit = jnp.eye(6, dtype=moved.dtype)[:, None, :, None]
-    alone = _alone(links.layout, jnp.broadcast_to(unit, (6, moved.shape[1], 6, worlds)))
     return jnp.concatenate([moved, alone], axis=2)
 
 
 def responses(links: Links, inertia: Inertia, worlds: int) -> Array:
     """Velocities (component, block, coordinate, world) under unit generalized impulses, with the joints held."""
     links, inertia = lax.stop_gradient((links, inertia))
-    rows, of_links = _rows(links.layout)
-    count = len(of_links)
+    alone = _alone(links.layout, _inverse(inertia, worlds))
+    rows, count = _rows(links.layout)
+    if not count:
+        return alone
     nothing = links.offset * 0.0
     sides = links.translations
     force = _select(rows, (*(side.linear for side in sides), nothing, nothing, nothing), worlds)
@@ -62,16 +65,16 @@ def responses(links: Links, inertia: Inertia, worlds: int) -> Array:
     tiled = repeat_worlds(links, count, worlds)
     moved = mechanism.respond(tiled, compute_once(flat, flat))
     moved = moved.reshape(*moved.shape[:2], count, -1)
-    return jnp.concatenate([moved, _alone(links.layout, _inverse(inertia, worlds))], axis=2)
+    return jnp.concatenate([moved, alone], axis=2)
 
 
-def _rows(found: Layout) -> tuple[np.ndarray, np.ndarray]:
-    """(6, link, coordinate) whether a coordinate of the links is along a row; the link of each."""
+def _rows(found: Layout) -> tuple[np.ndarray, int]:
+    """(6, link, coordinate) whether a coordinate of the links is along a row; their number."""
     row, link = np.nonzero(~found.held)
     order = np.argsort(link, kind="stable")
     row, link = row[order], link[order]
     here = (np.arange(6)[:, None, None] == row) & (np.arange(len(found.links))[:, None] == link)
-    return here, link
+    return here, len(link)
 
 
 def _select(rows: np.ndarray, of_rows: tuple[Vec3, ...], worlds: int) -> Vec3:

@@ -123,6 +123,24 @@ def test_a_leg_carries_a_free_ball(precision, gate):
     carry_a_ball(on_ground(), undamped(dt=1 / 60), gate)
 
 
+@pytest.mark.parametrize("ball", [True, False])
+def test_a_shelf_on_a_wall(ball, gate):
+    """Welded to what never moves, so that the mechanism has no way to move: a ball lies on it, or nothing does."""
+    builder = on_ground()
+    wall = builder.add_body(Box((0.1, 1.0, 1.0)), static=True, position=(-0.1, 1, 0), collides=False)
+    shelf = builder.add_body(Box((0.2, 0.02, 0.2)), mass=0.5, position=(0.2, 0.02, 0), friction=0.5)
+    builder.add_joint(Fixed(wall, shelf, (0, 0.02, 0)))
+    if ball:
+        builder.add_body(Sphere(0.1), mass=2.0, position=(0.2, 0.14, 0), friction=0.5)
+    model, state = builder.build(undamped(dt=1 / 60))
+    assert mechanism_layout.takes_contacts(model.scene)
+    final = stand(model, state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), 1e-5)
+    if ball:
+        on_shelf = np.asarray(contact_forces(model, final), float)[:, 1][-1]
+        gate("borne by the shelf / weight - 1", abs(on_shelf) / (2.0 * GRAVITY) - 1, 1e-4)
+
+
 def slide(speed=2.0, friction=0.25, dt=1 / 60, steps=24):
     """A welded sled whose foot is wide enough not to tip; all the way it slides. The usual sweeps leave 6.5e-4 of it."""
     builder = on_ground(friction)
