@@ -143,7 +143,7 @@ def _cost(scene: Scene) -> list[str]:
     options, sizes = scene.options, scene_sizes(scene)
     setting = options.solver
     cost = measured.expected_cost(setting, sizes)
-    # Of rows that are solved with the joints held, the cost grows with the square; no measured scene has any.
+    # Of rows that are solved with the joints held, the cost grows otherwise; no measured scene has any.
     held = bool(bounded_slots(scene)) or takes_contacts(scene)
     if cost is None or held or options.impact_events or options.substeps or options.sleep or options.continuous:
         return ["expected cost: not measured for these settings"]

@@ -12,8 +12,8 @@ from typing import NamedTuple
 from mathota_jax.scene import Scene
 
 MOST_ROWS = 192
-"""Rows of contacts and with bounds of the largest scene in which they are solved with the joints held: the matrix grows with
-their square."""
+"""Rows of contacts and with bounds of the largest scene in which they are solved with the joints held: the system behind
+their derivative grows with their square, and so does their matrix where there are as many ways to move."""
 
 FEWEST_TOUCHING = 8
 """Least room for what touches at the same time: one for each shape of a link, and more for free ones, which lie in heaps."""
