@@ -200,6 +200,13 @@ def unpack_blocks(velocity: Array) -> tuple[Vec3, Vec3 | None]:
     return Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None
 
 
+def respond_alone(inertia: Inertia, impulse: Array) -> Array:
+    """Velocities (component, block, ..., world) that impulses on bodies, likewise, give to each by itself."""
+    linear, angular = unpack_blocks(impulse)
+    assert angular is not None
+    return pack_blocks(linear * inertia.inverse_mass, inertia.solve(angular))
+
+
 def smaller_moving(model: Model, first: Sequence[int], second: Sequence[int]) -> Array:
     """(pair or 1, world) inner radius of the smaller moving body of each pair; infinite if none moves."""
     static = np.asarray(model.scene.static)

@@ -66,8 +66,9 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
         changes["contact_feature"] = jnp.where(problem.contacts.active, problem.contacts.feature, -1)
         if problem.offsets is not None:
             changes["contact_offset"] = jnp.stack(problem.offsets, axis=1)
-        if problem.contacts.converged is not None or problem.overflow is not None:
-            flags.append(_collision_flags(problem.contacts, problem.overflow))
+        overflow = problem.overflow
+        if problem.contacts.converged is not None or overflow is not None:
+            flags.append(_collision_flags(problem.contacts, overflow))
         if problem.close is not None:
             changes["contact_pair"] = compact_matching.pair_keys(scene, problem.close)
     return {**changes, "flags": functools.reduce(jnp.bitwise_or, flags)} if flags else changes

@@ -42,7 +42,7 @@ from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.rows import Rows, add_impulses
-from mathota_jax.spatial.indexing import in_every_world, take
+from mathota_jax.spatial.indexing import in_every_world, put, take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle, store_cotangents
 from mathota_jax.spatial.vector import Vec3, dot, where
@@ -327,7 +327,7 @@ def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.
 
     def change(impulses: tuple[Array, ...]) -> Array:
         of_chosen = mechanism_contacts.in_order(impulses)
-        return reduced.change(mechanism_contacts.scattered(of_chosen, chosen, reduced.delassus.count))
+        return reduced.change(put(of_chosen, chosen, reduced.delassus.count))
 
     # What the matrix changes at these impulses: it has no derivative of its own.
     left = take(reduced.rates(change(found)), chosen)

@@ -13,6 +13,13 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",
+    **{
+        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[10 and 100 s-{precision}]": "two boxes "
+        f"that bounce with a pendulum on one, at rest to a micrometre, gain {gain} times the energy of a lift by their "
+        "height in steps of 10 s, gate 0.01, and sink in steps of 100 s: what ten sweeps leave of the weight is lost height "
+        "by the square of the step; none in steps up to 1 s"
+        for precision, gain in (("float32", 2.4), ("float64", 12))
+    },
     "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
     "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "
     "stay so, gate 5 mm; 1 mm with the default solver",

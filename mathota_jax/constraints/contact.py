@@ -215,7 +215,7 @@ def contact_rows(
         side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
         falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
     ahead = None
-    if room is not None and room.count:
+    if room is not None and listed:
         ahead = pack_scalars(table, [chosen.separation + model.dt * jnp.minimum(start, free)], worlds)
     return ContactRows(
         rows,

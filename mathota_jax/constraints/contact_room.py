@@ -65,7 +65,7 @@ def _for_close(scene: Scene, links: frozenset[int], room: int) -> Places | None:
     on_links = sum(body in links for body in bodies)
     wanted = on_links + TOUCHING_A_FREE_SHAPE * (len(bodies) - on_links)
     pairs = min(scene.place_count, scene.options.touching_capacity or max(FEWEST_TOUCHING, wanted))
-    count = min(pairs * _places_of(most, points), _places_of_close(scene, points))
+    count = min(pairs * places_of_pair(most, points), _places_of_close(scene, points))
     return Places(count, points, False) if scene.static_slot_count + count * points <= room else None
 
 
@@ -73,8 +73,8 @@ def _for_all(scene: Scene, links: frozenset[int], room: int) -> Places | None:
     """As many as there is room for, if each shape of a link finds one, and what is on no link all that it may need."""
     most = max(group.point_count for group in (*scene.pair_groups, *scene.compact_groups))
     points = min(most, POINTS_OF_A_PLACE)
-    each, room = _places_of(most, points), room // points
-    own = [(not links.isdisjoint(bodies), _places_of(count, points)) for bodies, count in _own_pairs(scene)]
+    each, room = places_of_pair(most, points), room // points
+    own = [(not links.isdisjoint(bodies), places_of_pair(count, points)) for bodies, count in _own_pairs(scene)]
     every = sum(count for _, count in own) + _places_of_close(scene, points)
     if scene.options.touching_capacity is not None:
         count = min(scene.options.touching_capacity * each, every)
@@ -88,14 +88,14 @@ def _for_all(scene: Scene, links: frozenset[int], room: int) -> Places | None:
     return Places(min(room, every), points, True) if room >= min(least, every) else None
 
 
-def _places_of(point_count: int, points: int) -> int:
-    """Places of a pair."""
+def places_of_pair(point_count: int, points: int) -> int:
+    """How many places a pair takes."""
     return -(-point_count // points) if points else 0
 
 
 def _places_of_close(scene: Scene, points: int) -> int:
     """Places of all pairs that the broadphase may list at a time."""
-    return sum(group.place_count * _places_of(group.point_count, points) for group in scene.compact_groups)
+    return sum(group.place_count * places_of_pair(group.point_count, points) for group in scene.compact_groups)
 
 
 def _close_bodies(scene: Scene) -> list[int]:

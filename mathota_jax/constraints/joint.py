@@ -18,7 +18,7 @@ from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.mechanism_layout import bounded_slots
-from mathota_jax.constraints.mechanism_rows import Responses, own_mass
+from mathota_jax.constraints.mechanism_rows import Responses, felt_mass
 from mathota_jax.constraints.row_coefficients import Coefficients
 from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
 from mathota_jax.model import Model
@@ -27,7 +27,9 @@ from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Table
+from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import store_cotangents
+from mathota_jax.spatial.spread import diagonal
 from mathota_jax.spatial.vector import where
 
 
@@ -117,7 +119,8 @@ def _with_trees(scene: Scene, slots: np.ndarray, mass: Array, responses: Respons
     """
     bounded = bounded_slots(scene)
     inside = np.isin(slots, bounded)
-    own = own_mass(responses.matrix, mass, [bounded.index(slot) if slot in bounded else 0 for slot in slots.tolist()])
+    rows = [bounded.index(slot) if slot in bounded else 0 for slot in slots.tolist()]
+    own = felt_mass(take(diagonal(responses.matrix), rows), mass)
     return own if inside.all() else jnp.where(inside[:, None], own, mass)
 
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
+from mathota_jax.bodies import Inertia, respond_alone
 from mathota_jax.constraints import contact, mechanism, mechanism_coordinates, mechanism_links, row_sides
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.effective_mass import normal_bound, tangent_bound
@@ -89,12 +89,7 @@ class Reduced(NamedTuple):
         force = self.sides.push(impulses, layout.block_count)
         force = compute_once(force, force)
         moved = mechanism.respond(self.links, force)
-        if len(layout.links) == layout.block_count:
-            return moved
-        linear, angular = unpack_blocks(force)
-        assert angular is not None
-        alone = pack_blocks(linear * self.inertia.inverse_mass, self.inertia.solve(angular))
-        return jnp.where(np.isin(np.arange(layout.block_count), layout.blocks)[:, None], moved, alone)
+        return jnp.where(layout.is_link[:, None], moved, respond_alone(self.inertia, force)) if layout.alone else moved
 
     def contacts(self, groups: Sequence[Rows]) -> list[Rows]:
         """Those of all contacts that have places here, with laws and biases of `groups`: laws of all contacts."""
@@ -132,7 +127,8 @@ def reduce(
         found = touching(traced, room.count, room.points)
         close = found.rows([group.rows for group in traced])
         sides, contacts = sides._replace(traced=row_sides.traced_sides(close, worlds)), [*contacts, close]
-    delassus = lax.stop_gradient(_delassus(links, inertia, sides, worlds))
+    # Of the sides a part is static.
+    delassus = lax.stop_gradient(_delassus(*lax.stop_gradient((links, inertia)), sides, worlds))
     bounded = bounded_slots(scene)
     rows, first = [], len(bounded)
     if bounded:
@@ -235,13 +231,6 @@ def with_rates(groups: Sequence[Rows], delassus: Delassus, rates: Array) -> tupl
         found.append(dataclasses.replace(group, matrix=Dense((jacobian,), (response,))))
     still = at_rest(delassus, rates.shape[-1])
     return tuple(found), jnp.concatenate([still, jnp.ones_like(still[:1])])
-
-
-def scattered(values: Array, rows: np.ndarray, count: int) -> Array:
-    """Values (row, world) of all rows, from those of some; 0 for others."""
-    place = np.full(count, len(rows))
-    place[rows] = np.arange(len(rows))
-    return take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), place)
 
 
 def with_errors(groups: Sequence[Rows], errors: Array) -> tuple[Rows, ...]:

@@ -1,7 +1,7 @@
 """Coordinates of mechanisms: the ways in which their joints, and bodies without any, can move.
 
 A link has one for each of its six rows that is not held: the rate along that row while the rates along its others are 0.
-All is about the centres of mass, and without derivatives.
+All is about the centres of mass.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 
-from mathota_jax.bodies import Inertia, pack_blocks
+from mathota_jax.bodies import Inertia, pack_blocks, respond_alone
 from mathota_jax.constraints import mechanism
 from mathota_jax.constraints.mechanism_layout import Layout
 from mathota_jax.constraints.mechanism_links import Links, pack, shift_of_turn, to_blocks, to_parents, unpack
@@ -23,14 +23,12 @@ from mathota_jax.spatial.vector import Vec3, cross
 
 def coordinate_count(found: Layout) -> int:
     """Number of coordinates."""
-    return int((~found.held).sum()) + 6 * (found.block_count - len(found.links))
+    return int((~found.held).sum()) + 6 * len(found.alone)
 
 
 def motions(links: Links, worlds: int) -> Array:
     """Velocities (component, block, coordinate, world) at unit rates of the coordinates."""
-    links = lax.stop_gradient(links)
-    unit = jnp.eye(6, dtype=links.offset.x.dtype)[:, None, :, None]
-    alone = _alone(links.layout, jnp.broadcast_to(unit, (6, links.layout.block_count, 6, worlds)))
+    alone = _alone(links, worlds)
     rows, count = _rows(links.layout)
     if not count:
         return alone
@@ -49,8 +47,7 @@ def motions(links: Links, worlds: int) -> Array:
 
 def responses(links: Links, inertia: Inertia, worlds: int) -> Array:
     """Velocities (component, block, coordinate, world) under unit generalized impulses, with the joints held."""
-    links, inertia = lax.stop_gradient((links, inertia))
-    alone = _alone(links.layout, _inverse(inertia, worlds))
+    alone = respond_alone(jax.tree.map(lambda x: x[:, None], inertia), _alone(links, worlds))
     rows, count = _rows(links.layout)
     if not count:
         return alone
@@ -88,26 +85,9 @@ def _select(rows: np.ndarray, of_rows: tuple[Vec3, ...], worlds: int) -> Vec3:
     return total
 
 
-def _alone(found: Layout, values: Array) -> Array:
-    """(component, block, coordinate, world) of bodies without joints, from (component, block, component, world)."""
-    free = [block for block in range(found.block_count) if block not in found.blocks]
-    of_block, component = np.repeat(free, 6).astype(int), np.tile(np.arange(6), len(free))
-    here = np.arange(found.block_count)[:, None] == of_block
-    return jnp.where(here[..., None], values[:, :, component], 0.0)
-
-
-def _inverse(inertia: Inertia, worlds: int) -> Array:
-    """(component, block, component, world) inverse of the inertia of each body."""
-    inverse = inertia.inverse()
-    zero = jnp.zeros((len(inertia.inverse_mass), worlds), inertia.inverse_mass.dtype)
-    mass, (x, y, z) = inverse.inverse_mass, inverse.diagonal
-    yz, xz, xy = (zero, zero, zero) if inverse.products is None else inverse.products
-    rows = [
-        [mass, zero, zero, zero, zero, zero],
-        [zero, mass, zero, zero, zero, zero],
-        [zero, zero, mass, zero, zero, zero],
-        [zero, zero, zero, x, xy, xz],
-        [zero, zero, zero, xy, y, yz],
-        [zero, zero, zero, xz, yz, z],
-    ]
-    return jnp.stack([jnp.stack([entry + zero for entry in row], axis=1) for row in rows])
+def _alone(links: Links, worlds: int) -> Array:
+    """(component, block, coordinate, world) 1 for the component of the body without joints that a coordinate is, else 0."""
+    found = links.layout
+    component, of_block = np.tile(np.arange(6), len(found.alone)), np.repeat(np.asarray(found.alone, int), 6)
+    here = (np.arange(6)[:, None, None] == component) & (np.arange(found.block_count)[:, None] == of_block)
+    return jnp.broadcast_to(jnp.asarray(here, links.offset.x.dtype)[..., None], (*here.shape, worlds))

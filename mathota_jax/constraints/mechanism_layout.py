@@ -71,6 +71,16 @@ class Layout:
         return tuple(link.block for link in self.links)
 
     @functools.cached_property
+    def is_link(self) -> np.ndarray:
+        """(block,) whether a moving body is a link."""
+        return np.isin(np.arange(self.block_count), self.blocks)
+
+    @functools.cached_property
+    def alone(self) -> tuple[int, ...]:
+        """Velocity blocks of the others."""
+        return tuple(np.flatnonzero(~self.is_link).tolist())
+
+    @functools.cached_property
     def tree(self) -> Tree:
         """The links as the solver sees them."""
         floating = (place for place, link in enumerate(self.links) if link.parent == GROUND and not any(link.slots))
@@ -123,7 +133,7 @@ def layout(scene: Scene) -> Layout | None:
     if options.impact_events or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
-    if found is not None and (_takes_contacts(scene, found) or _has_no_others(scene, found)):
+    if found is not None and (_contact_places(scene, found) is not None or _has_no_others(scene, found)):
         return found
     return None if options.solver == "soft_step" else _of_trees(scene, LEAST_JOINTS)
 
@@ -167,16 +177,14 @@ def _has_no_others(scene: Scene, found: Layout) -> bool:
     return not scene.slot_count and _row_count(found) == joint_row_count(scene)
 
 
-def _takes_contacts(scene: Scene, found: Layout) -> bool:
+def _contact_places(scene: Scene, found: Layout) -> Places | None:
+    """`contact_places`, with these mechanisms."""
     if scene.options.solver != "pgs" or not scene.slot_count:
-        return False
-    if _row_count(found) + len(_bounded_slots(scene, found)) != joint_row_count(scene):
-        return False
-    return _contacts_on_links(scene, found) and _places(scene, found) is not None
-
-
-def _places(scene: Scene, found: Layout) -> Places | None:
-    return places_for(scene, _link_bodies(scene, found), len(_bounded_slots(scene, found)))
+        return None
+    bounded = len(_bounded_slots(scene, found))
+    if _row_count(found) + bounded != joint_row_count(scene) or not _contacts_on_links(scene, found):
+        return None
+    return places_for(scene, _link_bodies(scene, found), bounded)
 
 
 def _contacts_on_links(scene: Scene, found: Layout) -> bool:
@@ -231,7 +239,7 @@ def contact_places(scene: Scene) -> Places | None:
     None where they are not.
     """
     found = layout(scene)
-    return _places(scene, found) if found is not None and _takes_contacts(scene, found) else None
+    return None if found is None else _contact_places(scene, found)
 
 
 def takes_contacts(scene: Scene) -> bool:

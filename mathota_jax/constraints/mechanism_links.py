@@ -20,7 +20,7 @@ from mathota_jax.constraints.joint_rows import JointRows
 from mathota_jax.constraints.mechanism_layout import Layout, layout
 from mathota_jax.scene import Scene
 from mathota_jax.solver import tree
-from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.indexing import put, take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once, store, store_cotangents
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
@@ -271,8 +271,4 @@ def to_parents(found: Layout, values: Any) -> Any:
 
 def to_blocks(found: Layout, values: Array) -> Array:
     """(component, block, world) from (component, link, world), 0 for other bodies."""
-    place = np.full(found.block_count, len(found.links))
-    place[list(found.blocks)] = np.arange(len(found.links))
-    if len(found.links) < found.block_count:
-        values = jnp.concatenate([values, jnp.zeros_like(values[:, :1])], axis=1)
-    return take(values, place, axis=1)
+    return put(values, found.blocks, found.block_count, axis=1)

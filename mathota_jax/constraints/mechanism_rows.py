@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from mathota_jax.solver.delassus import Whole
 from mathota_jax.solver.laws import Bounded
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY
-from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.indexing import put, take
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_scaled, diagonal, repeat_worlds
@@ -70,19 +70,11 @@ def respond(links: mechanism_links.Links, sides: row_sides.RowSides, worlds: int
     force = compute_once(force, force)
     tiled = repeat_worlds(links, force.shape[2], worlds)
     velocity = mechanism.respond(tiled, force.reshape(*force.shape[:2], -1)).reshape(force.shape)
-    if len(links.layout.links) < block_count:
-        is_link = np.isin(np.arange(block_count), links.layout.blocks)[:, None, None]
-        velocity = jnp.where(is_link, velocity, sides.alone(block_count))
+    if links.layout.alone:
+        velocity = jnp.where(links.layout.is_link[:, None, None], velocity, sides.alone(block_count))
     velocity = compute_once(velocity, velocity)
     matrix = sides.matrix(velocity)
     return velocity, compute_once(matrix, matrix)
-
-
-def own_mass(matrix: Array, alone: Array, rows: Any) -> Array:
-    """``J M^-1 J^T`` of `rows` with the tree; `alone`: with their two bodies, (row, world), which allow more motion."""
-    rows = np.asarray(rows)
-    first = rows.max() + 1
-    return felt_mass(take(diagonal(matrix[:first, :first]), rows), alone)
 
 
 def felt_mass(own: Array, alone: Array) -> Array:
@@ -193,9 +185,7 @@ def of_slots(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Sequenc
 
 def to_tables(joint_rows: Sequence[Rows], slots: tuple[int, ...], values: Array) -> tuple[Array, ...]:
     """(turn, 1, column, world) for all tables from (row, world), 0 for other slots."""
-    place = np.full(_slot_count(joint_rows), len(slots))
-    place[np.asarray(slots)] = np.arange(len(slots))
-    of_all = take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), place)
+    of_all = put(values, slots, _slot_count(joint_rows))
     return tuple(pack_scalars(group.table, [select(group.table, of_all)], values.shape[-1]) for group in joint_rows)
 
 

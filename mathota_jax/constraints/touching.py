@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.constraints.contact import ContactRows, normal_mass, push_only
+from mathota_jax.constraints.contact_room import places_of_pair
 from mathota_jax.solver.laws import Cone
 from mathota_jax.solver.row_matrix import Dense, Points
 from mathota_jax.solver.rows import Places, Rows
@@ -159,7 +160,7 @@ def _both_sides(group: Rows, points: int, worlds: int) -> tuple[Array, Array]:
 
 def _part_count(table: AnyTable, points: int) -> int:
     """Parts of each constraint."""
-    return -(-table.together // points)
+    return places_of_pair(table.together, points)
 
 
 def _by_part(table: AnyTable, values: Array, points: int, otherwise: float = 0.0) -> Array:

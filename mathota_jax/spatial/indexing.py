@@ -30,6 +30,15 @@ def take(tree: Any, indices: Sequence[int] | np.ndarray, axis: int = 0) -> Any:
     return jax.tree.map(lambda x: jnp.take(x, index, axis=axis, unique_indices=False, mode="clip"), tree)
 
 
+def put(values: Array, places: Sequence[int] | np.ndarray, count: int, axis: int = 0) -> Array:
+    """`count` rows along `axis`, of which those at `places` (static) are the given ones and the others 0."""
+    place = np.full(count, len(places))
+    place[np.asarray(places, int)] = np.arange(len(places))
+    if len(places) < count:
+        values = jnp.concatenate([values, jnp.zeros_like(jax.lax.slice_in_dim(values, 0, 1, axis=axis))], axis=axis)
+    return take(values, place, axis=axis)
+
+
 def gather(values: Array, index: Array) -> Array:
     """Rows of an array (row, ..., world) by traced indices (place, world) that may differ between worlds.
 

@@ -29,13 +29,13 @@ LIGHT = (0.2, 2.0, 5.0, 50.0)
 """Masses of a foot and of what stands on it."""
 
 
-def leg(builder, masses, foot=(0.1, 0.02, 0.1), speed=0.0, friction=0.5):
-    """Blocks welded on top of each other, the first a foot on the ground; handles."""
+def leg(builder, masses, foot=(0.1, 0.02, 0.1), speed=0.0, friction=0.5, shape=None):
+    """Blocks welded on top of each other, the first a foot on the ground, of another `shape` if asked for; handles."""
     bodies, level = [], 0.0
     for mass in masses:
         half = (0.05, 0.1, 0.05) if bodies else foot
         body = builder.add_body(
-            Box(half),
+            shape if shape and not bodies else Box(half),
             mass=mass,
             position=(0, level + half[1], 0),
             velocity=(speed, 0, 0),

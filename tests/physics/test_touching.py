@@ -122,6 +122,16 @@ def test_pincers_press_with_the_torque_of_their_motors(precision, gate):
     gate("moved [m]", np.asarray(final.position - state.position, float), 1e-3)
 
 
+def stand_still(model, state, mass, moved, gate):
+    """For 120 steps, carried by the ground, without a flag."""
+    final = stand(model, state)
+    gate("moved [m]", np.asarray(final.position - state.position, float), moved)
+    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-4)
+    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
+    gate("borne by the ground / weight - 1", borne / (mass * GRAVITY) - 1, 1e-4)
+    assert not final.flags
+
+
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.slow
 @pytest.mark.parametrize("tiles", [0, 25])
@@ -129,13 +139,7 @@ def test_a_robot_that_may_touch_itself_stands(precision, tiles, gate):
     """It fell on its belly in a second: 36 pairs get a broadphase, where contacts were swept in turn with the joints."""
     model, state = quadruped("servo", undamped(dt=1 / 60), ignores_itself=tiles > 0, tiles=tiles)
     assert takes_contacts(model)
-    model = stiffened(model, "servo", 2000.0, 40.0)
-    final = jax.jit(lambda state: rollout(model, state, 120)[0])(state)
-    gate("moved [m]", np.asarray(final.position - state.position, float), 3e-4)
-    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-4)
-    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
-    gate("borne by the ground / weight - 1", borne / (22.4 * GRAVITY) - 1, 1e-4)
-    assert not final.flags
+    stand_still(stiffened(model, "servo", 2000.0, 40.0), state, 22.4, 3e-4, gate)
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
@@ -143,13 +147,7 @@ def test_a_humanoid_stands(precision, gate):
     """Rows for all of its 33 points on the plane leave too little room: swept in turn with its joints it sat down."""
     model, state = humanoid(undamped(dt=1 / 60))
     assert takes_contacts(model) and mechanism_layout.contact_places(model.scene).for_all
-    model = stiffened(model, "servo", 3000.0, 100.0)
-    final = jax.jit(lambda state: rollout(model, state, 120)[0])(state)
-    gate("moved [m]", np.asarray(final.position - state.position, float), 1e-4)
-    gate("speed at the end [m/s]", np.asarray(final.velocity), 1e-4)
-    borne = np.abs(np.asarray(contact_forces(model, final), float)[:, 1]).sum()
-    gate("borne by the ground / weight - 1", borne / (52.4 * GRAVITY) - 1, 1e-4)
-    assert not final.flags
+    stand_still(stiffened(model, "servo", 3000.0, 100.0), state, 52.4, 1e-4, gate)
 
 
 def studded(options, friction=0.5, speed=0.0):
@@ -159,14 +157,7 @@ def studded(options, friction=0.5, speed=0.0):
     corners = [(x, 0.0, z) for x in (-0.6, 0.6) for z in (-0.3, 0.3)]
     inner = [(x, 0.01, z) for x in np.linspace(-0.5, 0.5, 11) for z in np.linspace(-0.25, 0.25, 6)]
     studs = Compound([(Sphere(0.02), (place, turned)) for place in (*corners, *inner)])
-    foot = builder.add_body(studs, mass=0.2, position=(0, 0.02, 0), velocity=(speed, 0, 0), friction=friction)
-    bodies = [foot]
-    for number, mass in enumerate((2.0, 5.0, 50.0)):
-        place = (0, 0.14 + 0.2 * number, 0)
-        block = Box((0.05, 0.1, 0.05))
-        body = builder.add_body(block, mass=mass, position=place, velocity=(speed, 0, 0), collides=False)
-        builder.add_joint(Fixed(bodies[-1], body, (0, 0.04 + 0.2 * number, 0)))
-        bodies.append(body)
+    bodies = leg(builder, LIGHT, (0.6, 0.02, 0.3), speed, friction, studs)
     return *builder.build(options), bodies
 
 

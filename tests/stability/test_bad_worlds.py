@@ -130,15 +130,25 @@ def test_a_bad_world_leaves_the_derivatives_of_the_others_alone(swings):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-def test_time_steps_out_of_all_proportion(precision, gate):
-    """Steps of 1e-12 s to 100 s: finite; boxes at rest stay there, and nothing gains energy."""
+@pytest.mark.parametrize(
+    "steps", [(1e-12, 1e-6, 1e-3, 1 / 60, 0.1, 0.3, 0.6, 1.0), (10.0, 100.0)], ids=["up to 1 s", "10 and 100 s"]
+)
+def test_time_steps_out_of_all_proportion(precision, steps, gate):
+    """Finite; nothing gains energy, from whatever side of round-off it starts."""
     models, states = batch()
-    states = dataclasses.replace(states, velocity=jnp.zeros_like(states.velocity))
-    times = np.array([1e-12, 1e-6, 1e-3, 1 / 60, 0.1, 1.0, 10.0, 100.0])
+    times = np.resize(steps, WORLDS)
+    nudge = 1e-6 * np.random.default_rng(0).normal(size=states.position[:, 1:].shape)
+    states = dataclasses.replace(
+        states,
+        position=states.position.at[:, 1:].add(jnp.asarray(nudge, states.position.dtype)),
+        velocity=jnp.zeros_like(states.velocity),
+    )
     models = dataclasses.replace(models, dt=jnp.asarray(times, models.dt.dtype))
     before = np.asarray(jax.vmap(energy)(models, states), float)
-    final = advance_worlds(models, states, 20)
-    assert finite(final).all()
-    rise = np.asarray(jax.vmap(energy)(models, final), float) - before
+    rise = np.zeros(WORLDS)
+    for _ in range(20):
+        states = advance_worlds(models, states, 1)
+        rise = np.maximum(rise, np.asarray(jax.vmap(energy)(models, states), float) - before)
+    assert finite(states).all()
     # 10 kg and 10 kg lifted by their height.
-    gate("energy gained / that of the boxes", np.maximum(rise, 0.0) / (2 * 10 * 9.81), 0.01)
+    gate("energy gained / that of the boxes", rise / (2 * 10 * 9.81), 0.01)
