@@ -26,19 +26,14 @@ from mathota_jax.constraints.mechanism_layout import bounded_slots, contact_plac
 from mathota_jax.constraints.mechanism_rows import of_slots, respond, to_tables, with_tree
 from mathota_jax.constraints.touching import Touching, touching
 from mathota_jax.scene import Scene
-from mathota_jax.solver import pgs
 from mathota_jax.solver.delassus import Delassus, Factored, Whole
 from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Dense, Entries
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import EMPTY, Table, TracedTable
 from mathota_jax.spatial.indexing import in_every_world, take
-from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.spread import add_slices
-
-LARGEST_STEP = 1.9
-"""Bound of the eigenvalues of the matrix of a constraint times its steps; sweeps diverge at 2."""
 
 
 class _Class(NamedTuple):
@@ -308,9 +303,8 @@ def _contact_group(group: Rows, members: _Class, delassus: Delassus, first: int)
     if not isinstance(law, Cone):
         return _group(_one_a_turn(turns, points), contact.push_only(normal[:, None]), bias, delassus, first)
     tangent = safe_divide(active, tangent_bound(entries, points, active))
-    share = _convergent(own, normal, tangent, active)
     grip = None if law.first_grip is None else of_points(law.first_grip)
-    law = Cone(normal * share, tangent * share, of_points(law.friction), grip)
+    law = Cone(normal, tangent, of_points(law.friction), grip)
     return _group(_one_a_turn(turns, points), law, bias, delassus, first)
 
 
@@ -323,30 +317,6 @@ def _entries(own: Array) -> tuple[Entries, Entries]:
         [[[values[m, :, :, row] for m in range(size)] for row in range(rows)]]
         for values in (unit, jnp.moveaxis(own, 1, 0))
     )
-
-
-def _convergent(own: Array, normal: Array, tangent: Array, active: Array) -> Array:
-    """Share (turn, 1, world) of the steps of a constraint with which its sweeps converge; usually 1.
-
-    Its rows see the errors before the turn. Where a body is much taller than wide, a push along the normal of a point turns
-    it as a pull along the tangents does, and the two steps add up. The largest eigenvalue of the matrix of all rows, times
-    their steps, must be below 2 (the bound is that of `normal_bound`). As many are not 0 as two rigid bodies have ways to
-    move at their points against each other: three at one, five at two, six at more.
-
-    Args:
-        own: (turn, row, point, row of the point, world) the matrix of the rows of each constraint.
-        normal, tangent: (turn, point, world) effective masses.
-        active: (turn, point, world) 1 for points that touch, else 0.
-    """
-    turns, size, *_, worlds = own.shape
-    steps = jnp.stack([pgs.OVER_RELAXATION * normal, tangent, tangent], axis=2).reshape(turns, size, 1, worlds)
-    matrix = own.reshape(turns, size, size, worlds)
-    trace = functools.reduce(jnp.add, [matrix[:, row, row] * steps[:, row, 0] for row in range(size)])
-    norm = add_slices(add_slices(matrix * matrix * steps * jnp.swapaxes(steps, 1, 2), 1), 1)
-    points = add_slices(active, 1)
-    rank = jnp.where(points > 2.0, 6.0, jnp.where(points > 1.0, 5.0, 3.0))
-    bound = (trace + safe_sqrt(jnp.maximum((rank - 1.0) * (rank * norm - trace * trace), 0.0))) / rank
-    return jnp.minimum(1.0, safe_divide(jnp.full_like(bound, LARGEST_STEP), bound))[:, None]
 
 
 @functools.cache

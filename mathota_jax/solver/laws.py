@@ -102,11 +102,11 @@ class Cone:
         return dataclasses.replace(self, normal_mass=self.normal_mass * factor)
 
     def update(self, impulse: Array, error: Array) -> Array:
-        """Normal row first, then the tangents with the normal's new impulse."""
+        """Normal row first, then the tangents with its new impulse, but with errors from before."""
         row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
         old_n, *old = unstack(impulse, row)
         error_n, *errors = unstack(error, row)
-        return self.with_friction(jnp.maximum(old_n - error_n * self.normal_mass, 0.0), old, errors)
+        return self.with_friction(self.push(old_n, error_n), old, errors)
 
     def change(self, impulse: Array, error: Array) -> Array:
         """`update` less the old impulse, to the last digit of a small change of a large impulse."""
@@ -123,13 +123,19 @@ class Cone:
         """The impulse with the normal row not below 0 and the tangents within friction."""
         return self.update(impulse, jnp.zeros_like(impulse))
 
+    def push(self, impulse: Array, error: Array) -> Array:
+        """New impulse of the normal row."""
+        return jnp.maximum(impulse - error * self.normal_mass, 0.0)
+
+    def hold(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> list[Array]:
+        """New impulses of the tangents for one of the normal row."""
+        free_1, free_2 = (part - error * self.tangent_mass for part, error in zip(old, errors, strict=True))
+        scale = self._share(normal, free_1, free_2)
+        return [free_1 * scale, free_2 * scale]
+
     def with_friction(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> Array:
         """All three rows for a new impulse of the normal row; `old` and `errors` are those of the tangents."""
-        (old_1, old_2), (error_1, error_2) = old, errors
-        free_1 = old_1 - error_1 * self.tangent_mass
-        free_2 = old_2 - error_2 * self.tangent_mass
-        scale = self._share(normal, free_1, free_2)
-        return jnp.stack([normal, free_1 * scale, free_2 * scale], axis=normal.ndim - 2)
+        return jnp.stack([normal, *self.hold(normal, old, errors)], axis=normal.ndim - 2)
 
     def _share(self, normal: Array, free_1: Array, free_2: Array) -> Array:
         """What friction leaves of tangential impulses: 1 where it holds."""

@@ -19,7 +19,7 @@ from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
 from mathota_jax.spatial.vector import Vec3
-from mathota_jax.struct import pytree
+from mathota_jax.struct import pytree, static
 
 Entries = list[list[list[Array]]]
 """Components (turn, column, world) of the parts of a matrix, by part and row."""
@@ -52,6 +52,10 @@ class Dense:
         """``M^-1 J^T p`` (component, constraint, world) of each side, summed over the rows and columns of a constraint."""
         return [_sum(side, impulse, together) for side in self.response]
 
+    def changes_once(self, impulse: Array, together: int) -> list[Array]:
+        """`changes` of a single turn, stored."""
+        return [store(_sum(side, impulse, together), side[0, :, ::together]) for side in self.response]
+
     def linear_responses(self) -> list[tuple[Array, Array | float]]:
         """For each side the first three components of the response, and a factor (..., constraint, world) on them."""
         return [(side[..., :3, :, :], 1.0) for side in self.response]
@@ -59,6 +63,10 @@ class Dense:
     def first_row(self) -> Dense:
         """That of the first row of each constraint alone."""
         return Dense(*(tuple(_first(side) for side in sides) for sides in (self.jacobian, self.response)))
+
+    def other_rows(self) -> Dense:
+        """That of the others."""
+        return Dense(*(tuple(_others(side) for side in sides) for sides in (self.jacobian, self.response)))
 
     def dense(self) -> Dense:
         return self
@@ -132,6 +140,11 @@ class Points:
         angular = [side.solve(Vec3(*unstack(torque, 0))) for side, torque in zip(self.inertia, torques, strict=True)]
         return [jnp.concatenate([moved, jnp.stack(turned)]) for moved, turned in zip(linear, angular, strict=True)]
 
+    def changes_once(self, impulse: Array, together: int) -> list[Array]:
+        """As `Dense.changes_once`."""
+        found = self.changes(impulse, together)
+        return [store(part, self.packed[0, : len(part), ::together]) for part in found]
+
     def linear(self) -> tuple[Array, ...]:
         """The first three components of the Jacobian of each side."""
         return tuple(self.directions * sign for sign in self._signs)
@@ -149,6 +162,10 @@ class Points:
     def first_row(self) -> Points:
         """As `Dense.first_row`."""
         return Points(_first(self.packed), self.packed_inertia)
+
+    def other_rows(self) -> Points:
+        """As `Dense.other_rows`."""
+        return Points(_others(self.packed), self.packed_inertia)
 
     def dense(self) -> Dense:
         """The same rows with all entries. Stored: each product, and each cotangent, would compute them again."""
@@ -198,10 +215,12 @@ class Picked:
     Attributes:
       response: ``M^-1 J^T`` (..., row, component, column, world).
       first: (..., 1) int32 component of the first column of a turn; the others follow column by column, row by row.
+      left_out: number of rows before the first and after the last of these.
     """
 
     response: Array
     first: Array
+    left_out: tuple[int, int] = static(default=(0, 0))
 
     @property
     def like(self) -> Array:
@@ -211,13 +230,27 @@ class Picked:
     def rates(self, velocities: Sequence[Array]) -> Array:
         """As `Dense.rates`, of one turn."""
         rows, _, columns, _ = self.response.shape
+        before, after = self.left_out
+        every = before + rows + after
         (velocity,) = velocities
-        own = jax.lax.dynamic_slice_in_dim(velocity[:, 0], self.first[0], rows * columns)
-        return jnp.swapaxes(own.reshape(columns, rows, -1), 0, 1)
+        own = jax.lax.dynamic_slice_in_dim(velocity[:, 0], self.first[0], every * columns)
+        return jnp.swapaxes(own.reshape(columns, every, -1)[:, before : before + rows], 0, 1)
 
     def changes(self, impulse: Array, together: int) -> list[Array]:
         """As `Dense.changes`."""
         return [_sum(self.response, impulse, together)]
+
+    def changes_once(self, impulse: Array, together: int) -> list[Array]:
+        """As `Dense.changes_once`."""
+        return [store(_sum(self.response, impulse, together), self.response[0, :, ::together])]
+
+    def first_row(self) -> Picked:
+        """As `Dense.first_row`."""
+        return Picked(_first(self.response), self.first, (0, self.response.shape[-4] - 1))
+
+    def other_rows(self) -> Picked:
+        """As `Dense.other_rows`."""
+        return Picked(_others(self.response), self.first, (1, 0))
 
     def dense(self) -> Dense:
         """The same rows with all entries; turns, no single one."""
@@ -276,6 +309,10 @@ def _entries(array: Array) -> list[list[Array]]:
 
 def _first(rows: Array) -> Array:
     return rows[..., :1, :, :, :]
+
+
+def _others(rows: Array) -> Array:
+    return rows[..., 1:, :, :, :]
 
 
 def _along(rows: Array, velocity: Array) -> Array:

@@ -62,18 +62,34 @@ class ConeSlopes:
         """As `BoundedSlopes.update`."""
         row = impulse.ndim - 3
         (normal, *tangents), (error_n, *errors) = unstack(impulse, row), unstack(error, row)
-        normal = self.pressing * (normal - self.normal_mass * error_n)
-        free = [old - self.tangent_mass * error for old, error in zip(tangents, errors, strict=True)]
-        return self._stack(normal, self._held(free, self.friction * normal), row)
+        normal = self.push(normal, error_n)
+        return self._stack(normal, self.hold(normal, tangents, errors), row)
+
+    def push(self, impulse: Array, error: Array) -> Array:
+        """`update` of the normal row."""
+        return self.pressing * (impulse - self.normal_mass * error)
+
+    def hold(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> list[Array]:
+        """`update` of the tangents for a new impulse of the normal row."""
+        free = [part - self.tangent_mass * error for part, error in zip(old, errors, strict=True)]
+        return self._held(free, self.friction * normal)
 
     def transposed(self, new: Array) -> tuple[Array, Array]:
         """As `BoundedSlopes.transposed`."""
         row = new.ndim - 3
         normal, *tangents = unstack(new, row)
-        normal = self.pressing * (normal + self.friction * self._along(tangents))
-        free = self._held(tangents, 0.0)
+        normal = self.push_back(normal, tangents)
+        free = self.hold_back(tangents)
         by_error = self._stack(-self.normal_mass * normal, [-self.tangent_mass * part for part in free], row)
         return self._stack(normal, free, row), by_error
+
+    def push_back(self, normal: Array, tangents: Sequence[Array]) -> Array:
+        """The transpose of `update` for the impulse of the normal row."""
+        return self.pressing * (normal + self.friction * self._along(tangents))
+
+    def hold_back(self, tangents: Sequence[Array]) -> list[Array]:
+        """The same for those of the tangents."""
+        return self._held(tangents, 0.0)
 
     def _along(self, tangents: Sequence[Array]) -> Array:
         return self.direction[0] * tangents[0] + self.direction[1] * tangents[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.rows import Rows, first_row_velocity
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide
-from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.struct import pytree
 
 PHASE = 2.0 * math.pi / 4.0
@@ -100,9 +101,13 @@ class Manifold:
     lasting: Array | None
 
     def update(self, impulse: Array, error: Array) -> Array:
-        """Normals of a manifold by projected passes, then friction."""
+        """Contacts without friction."""
+        return self.push(impulse, error)
+
+    def push(self, impulse: Array, error: Array) -> Array:
+        """Normals of a manifold (1, column, world), by projected passes."""
         mass = self.base.normal_mass if isinstance(self.base, Cone) else self.base.effective_mass[0]
-        old, error_normal = impulse[0], error[0]
+        old, error_normal = impulse[0], compute_once(error[0], error)  # every pass reads it
         if self.softness is not None:
             mass = mass / (1.0 + mass * self.softness)
         new = old
@@ -113,13 +118,16 @@ class Manifold:
             new = jnp.maximum(new - mass * residual, 0.0)
         if self.lasting is not None:
             new = jnp.maximum(old + jnp.where(self.lasting, CONTACT_OVER_RELAXATION, 1.0) * (new - old), 0.0)
-        if not isinstance(self.base, Cone):
-            return new[None]
+        return new[None]
+
+    def hold(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> list[Array]:
+        """Tangents (column, world) for new impulses of the normals."""
         base = self.base
+        assert isinstance(base, Cone)
         if self.lasting is not None:
             longer = base.tangent_mass * jnp.where(self.lasting, 1.0, FIRST_GRIP)
             base = dataclasses.replace(base, tangent_mass=longer)
-        return base.with_friction(new, (impulse[1], impulse[2]), (error[1], error[2]))
+        return base.hold(normal, old, errors)
 
     def _respond(self, change: Array) -> Array:
         """Change of the normal velocities of the columns by changes of their impulses, manifold by manifold."""

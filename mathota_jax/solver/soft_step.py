@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.solver import pgs
+from mathota_jax.solver import sweeps
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
 from mathota_jax.solver.soft_laws import (
     Group,
@@ -195,10 +195,7 @@ def _sweep(
     velocity: Array,
     impulses: tuple[Array, ...],
 ) -> tuple[Array, tuple[Array, ...]]:
-    def update(_: Array | int, law: Any, __: Array, impulse: Array, error: Array) -> Array:
-        return law.update(impulse, error)
-
-    return pgs.sweeps(count, rows, update, laws, biases, velocity, impulses)
+    return sweeps.run(count, rows, lambda _: sweeps.of_law(), laws, biases, velocity, impulses)
 
 
 @_sweep.defjvp

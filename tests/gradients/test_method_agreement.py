@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Options, Sphere, rollout, step
-from mathota_jax.solver import pgs
+from mathota_jax.solver import pgs, sweeps
 from tests.scenes import body_on_plane, box_stack, slab_on_plane, undamped
 from tests.unit.test_converged import BODIES, random_problem, rows_of
 
@@ -25,7 +25,7 @@ def test_unrolled_sweeps_have_the_implicit_derivative(float64, friction, gate):
 
     def unrolled(count):
         def run(velocity):
-            return pgs.sweeps(count, rows, lambda _, law, __, x, e: law.update(x, e), laws, biases, velocity, start)[0]
+            return sweeps.run(count, rows, lambda _: sweeps.of_law(), laws, biases, velocity, start)[0]
 
         return run
 

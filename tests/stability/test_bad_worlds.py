@@ -131,11 +131,16 @@ def test_a_bad_world_leaves_the_derivatives_of_the_others_alone(swings):
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.parametrize(
-    "steps", [(1e-12, 1e-6, 1e-3, 1 / 60, 0.1, 0.3, 0.6, 1.0), (10.0, 100.0)], ids=["up to 1 s", "10 and 100 s"]
+    ("steps", "swings"),
+    [
+        pytest.param((1e-12, 1e-6, 1e-3, 1 / 60, 0.1, 0.3, 0.6, 1.0), True, id="up to 1 s"),
+        pytest.param((10.0, 100.0), True, id="10 and 100 s"),
+        pytest.param((1.0, 10.0, 30.0, 100.0), False, id="without joints"),
+    ],
 )
-def test_time_steps_out_of_all_proportion(precision, steps, gate):
+def test_time_steps_out_of_all_proportion(precision, steps, swings, gate):
     """Finite; nothing gains energy, from whatever side of round-off it starts."""
-    models, states = batch()
+    models, states = batch(swings=swings)
     times = np.resize(steps, WORLDS)
     nudge = 1e-6 * np.random.default_rng(0).normal(size=states.position[:, 1:].shape)
     states = dataclasses.replace(

@@ -1,0 +1,167 @@
+"""Sweeps over rows, turn by turn, in which a law finds new impulses from the errors that it sees.
+
+A sweep is unrolled over few turns, where slicing with a traced index was measured to cost 3x, and a scan over many.
+
+Of a contact with friction the normals answer first, and the tangents to what the normals have left. A push along the normals
+of a box on its face turns it as a pull along its tangents does: if both answer to the same errors the same turn is corrected
+twice. Measured for a cube with the steps of `pgs`: such a sweep multiplies what is left by 1.24, this one by 0.59.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.solver.laws import Cone, Law
+from mathota_jax.solver.row_matrix import RowMatrix
+from mathota_jax.solver.rows import UNROLLED_TURNS, Rows, gather, receive
+from mathota_jax.solver.table import Table, TracedTable
+from mathota_jax.spatial import counter
+from mathota_jax.spatial.settle import store
+
+
+class Update(NamedTuple):
+    """How a turn finds its new impulses (row, column, world).
+
+    Attributes:
+      at_once: from coefficients, biases, impulses and errors of all rows.
+      first: those of the first rows, likewise.
+      others: those of the others, from coefficients, biases, impulses of all rows before, new ones of the first rows, and
+        the errors of the others that these leave. Both are None where all rows answer at once.
+    """
+
+    at_once: Callable[[Any, Array, Array, Array], Array]
+    first: Callable[[Any, Array, Array, Array], Array] | None = None
+    others: Callable[[Any, Array, Array, Array, Array], Array] | None = None
+
+
+def of_law(prepare: Callable[[Any, Array], Any] = lambda law, _: law) -> Update:
+    """That of laws, which are the coefficients; `prepare` may change them, from their biases."""
+    return Update(
+        lambda law, bias, impulse, error: prepare(law, bias).update(impulse, error),
+        lambda law, bias, impulse, error: prepare(law, bias).push(impulse[:1], error),
+        lambda law, _, impulse, normal, error: jnp.stack(law.hold(normal[0], tuple(impulse[1:]), tuple(error))),
+    )
+
+
+def run(
+    iterations: int,
+    rows: tuple[Rows, ...],
+    update: Callable[[Array | int], Update],
+    coefficients: tuple[object, ...],
+    biases: tuple[Array, ...],
+    velocity: Array,
+    impulses: tuple[Array, ...],
+) -> tuple[Array, tuple[Array, ...]]:
+    """A number of sweeps, whose derivative is that of every update.
+
+    Args:
+      iterations: that number.
+      rows: groups of rows, swept in this order.
+      update: of each sweep, from its number.
+      coefficients: what the update gets of each group, with a leading turn axis.
+      biases, impulses: of each group (turn, row, column, world).
+      velocity: (component, block, world) with those impulses.
+
+    Returns:
+      The velocity and the impulses after the sweeps.
+    """
+
+    def sweep(number: Array | int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+        return once(rows, update(number), coefficients, biases, *carry)
+
+    if iterations == 1:
+        return sweep(0, (velocity, impulses))
+    return lax.fori_loop(0, iterations, sweep, (velocity, impulses))
+
+
+def once(
+    rows: tuple[Rows, ...],
+    update: Update,
+    coefficients: tuple[object, ...],
+    biases: tuple[Array, ...],
+    velocity: Array,
+    impulses: tuple[Array, ...],
+) -> tuple[Array, tuple[Array, ...]]:
+    """One pass over all groups."""
+    new = []
+    for group, coefficient, bias, impulse in zip(rows, coefficients, biases, impulses, strict=True):
+        velocity, impulse = _sweep(group, update, coefficient, bias, velocity, impulse)
+        new.append(impulse)
+    return velocity, tuple(new)
+
+
+def _sweep(
+    group: Rows, update: Update, coefficients: object, bias: Array, velocity: Array, impulse: Array
+) -> tuple[Array, Array]:
+    """One pass over the turns of a group."""
+    table: Table | TracedTable = group.table
+    fixed = (group.matrix, bias, coefficients)
+    if isinstance(table, TracedTable):
+        return _sweep_places(group, update, fixed, velocity, impulse)
+    scanned = (*fixed, impulse)
+    if table.turn_count <= UNROLLED_TURNS:
+        new = []
+        for turn in range(table.turn_count):
+            blocks = tuple(side[turn] for side in table.blocks)
+            receivers = table.receivers[turn]
+            at_turn = jax.tree.map(lambda x, turn=turn: x[turn], scanned)
+            velocity, at_turn = _turn(group.law, update, table.together, velocity, blocks, receivers, at_turn)
+            new.append(at_turn)
+        return velocity, jnp.stack(new)
+
+    def body(velocity: Array, at_turn: tuple) -> tuple[Array, Array]:
+        blocks, receivers, values = at_turn
+        return _turn(group.law, update, table.together, velocity, blocks, receivers, values)
+
+    indices = tuple(jnp.asarray(side, jnp.int32) for side in table.blocks)
+    return lax.scan(body, velocity, (indices, jnp.asarray(table.receivers), scanned))
+
+
+def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, impulse: Array) -> tuple[Array, Array]:
+    """One pass over those turns of a traced table that hold a constraint."""
+    places = group.places
+    assert places is not None
+
+    def body(_: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        turn, velocity, impulse = carry
+        blocks, values = counter.row((places.blocks, (*fixed, impulse)), turn)
+        *values, old = values
+        matrix: RowMatrix = values[0]
+        # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
+        old = store(old, matrix.like)
+        velocity, new = _turn(group.law, update, group.table.together, velocity, blocks, blocks, (*values, old))
+        return counter.following(turn), velocity, counter.put(impulse, new, turn)
+
+    turns = group.table.turn_count if places.turns is None else places.turns
+    return lax.fori_loop(0, turns, body, (counter.start(), velocity, impulse))[1:]
+
+
+def _turn(
+    law: Law, update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
+) -> tuple[Array, Array]:
+    """Solves the rows of one turn side by side."""
+    matrix, bias, coefficients, impulse = values
+    moving = [gather(velocity, side, together) for side in blocks]
+    if isinstance(law, Cone) and update.first is not None and update.others is not None:
+        first, others = matrix.first_row(), matrix.other_rows()
+        normal = update.first(coefficients, bias, impulse, bias[:1] + first.rates(moving))
+        normal = store(normal, first.like)
+        pushed = first.changes_once(normal - impulse[:1], together)
+        moving = [
+            old + (part if part.shape[1] == 1 else jnp.repeat(part, together, axis=1))
+            for old, part in zip(moving, pushed, strict=True)
+        ]
+        error = store(bias[1:] + others.rates(moving), others.like)
+        held = store(update.others(coefficients, bias, impulse, normal, error), others.like)
+        changes = [a + b for a, b in zip(pushed, others.changes(held - impulse[1:], together), strict=True)]
+        return receive(velocity, receivers, changes), jnp.concatenate([normal, held])
+    # Stored, because each row of the law reads several errors, and every later turn the impulses: what is not stored is
+    # computed again for each.
+    error = store(bias + matrix.rates(moving), matrix.like)
+    new = store(update.at_once(coefficients, bias, impulse, error), matrix.like)
+    return receive(velocity, receivers, matrix.changes(new - impulse, together)), new
