@@ -160,7 +160,6 @@ def _linear_sweeps(
 
         return relaxed
 
-    assert update.first is not None and update.others is not None
     update = Update(update.at_once, longer(update.first, slice(0, 1)), longer(update.others, slice(1, None)))
 
     def sweep(now: tuple, before: tuple) -> tuple:

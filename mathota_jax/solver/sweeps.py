@@ -28,15 +28,15 @@ class Update(NamedTuple):
     """How a turn finds its new impulses (row, column, world).
 
     Attributes:
-      at_once: from coefficients, biases, impulses and errors of all rows.
-      first: those of the first rows, likewise.
-      others: those of the others, from coefficients, biases, impulses of all rows before, new ones of the first rows, and
-        the errors of the others that these leave. Both are None where all rows answer at once.
+      at_once: of rows without friction, from their coefficients, biases, impulses and errors.
+      first: of the normals of contacts with friction, from coefficients and biases, the impulses of all their rows, and the
+        errors of the normals.
+      others: of their tangents, likewise, from the new impulses of the normals and the errors that these leave, too.
     """
 
     at_once: Callable[[Any, Array, Array, Array], Array]
-    first: Callable[[Any, Array, Array, Array], Array] | None = None
-    others: Callable[[Any, Array, Array, Array, Array], Array] | None = None
+    first: Callable[[Any, Array, Array, Array], Array]
+    others: Callable[[Any, Array, Array, Array, Array], Array]
 
 
 def of_law(prepare: Callable[[Any, Array], Any] = lambda law, _: law) -> Update:
@@ -147,10 +147,10 @@ def _turn(
     """Solves the rows of one turn side by side."""
     matrix, bias, coefficients, impulse = values
     moving = [gather(velocity, side, together) for side in blocks]
-    if isinstance(law, Cone) and update.first is not None and update.others is not None:
+    # Errors and impulses are stored: what is not is computed again by all that reads it, of the later turns, too.
+    if isinstance(law, Cone):
         first, others = matrix.first_row(), matrix.other_rows()
-        normal = update.first(coefficients, bias, impulse, bias[:1] + first.rates(moving))
-        normal = store(normal, first.like)
+        normal = store(update.first(coefficients, bias, impulse, bias[:1] + first.rates(moving)), first.like)
         pushed = first.changes_once(normal - impulse[:1], together)
         moving = [
             old + (part if part.shape[1] == 1 else jnp.repeat(part, together, axis=1))
@@ -160,8 +160,6 @@ def _turn(
         held = store(update.others(coefficients, bias, impulse, normal, error), others.like)
         changes = [a + b for a, b in zip(pushed, others.changes(held - impulse[1:], together), strict=True)]
         return receive(velocity, receivers, changes), jnp.concatenate([normal, held])
-    # Stored, because each row of the law reads several errors, and every later turn the impulses: what is not stored is
-    # computed again for each.
     error = store(bias + matrix.rates(moving), matrix.like)
     new = store(update.at_once(coefficients, bias, impulse, error), matrix.like)
     return receive(velocity, receivers, matrix.changes(new - impulse, together)), new
