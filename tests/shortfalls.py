@@ -14,11 +14,20 @@ SHORTFALLS: dict[str, str] = {
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
-        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[10 and 100 s-{precision}]": "two boxes "
-        f"that bounce with a pendulum on one, at rest to a micrometre, gain {gain} times the energy of a lift by their "
-        "height in steps of 10 s, gate 0.01, and sink in steps of 100 s: what ten sweeps leave of the weight is lost height "
-        "by the square of the step; none in steps up to 1 s"
-        for precision, gain in (("float32", 2.4), ("float64", 12))
+        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{scene}-{precision}]": f"two boxes {what}, "
+        f"at rest to a micrometre, gain {gain} times the energy of a lift by their height, gate 0.01; none in steps up to 1 s, "
+        "and boxes none with the converged solver"
+        for scene, precision, what, gain in (
+            ("10 and 100 s", "float32", "with a pendulum on one", 537),
+            ("10 and 100 s", "float64", "with a pendulum on one", 727),
+            ("no joint, 30 and 100 s", "float32", "beside one that falls", 1355),
+            ("no joint, 30 and 100 s", "float64", "beside one that falls", 516),
+        )
+    },
+    **{
+        f"tests/physics/test_stiff_drives.py::test_derivative_of_a_crouch[{mode}-2000.0-0.025]": "3.2 %, gate 2.5 %: "
+        "the derivative is that of impulses that ten sweeps have not quite reached; by central differences 0.7 %"
+        for mode in ("jacfwd", "jacrev")
     },
     "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
     "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "

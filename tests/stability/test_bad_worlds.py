@@ -135,7 +135,7 @@ def test_a_bad_world_leaves_the_derivatives_of_the_others_alone(swings):
     [
         pytest.param((1e-12, 1e-6, 1e-3, 1 / 60, 0.1, 0.3, 0.6, 1.0), True, id="up to 1 s"),
         pytest.param((10.0, 100.0), True, id="10 and 100 s"),
-        pytest.param((1.0, 10.0, 30.0, 100.0), False, id="without joints"),
+        pytest.param((30.0, 100.0), False, id="no joint, 30 and 100 s"),
     ],
 )
 def test_time_steps_out_of_all_proportion(precision, steps, swings, gate):
