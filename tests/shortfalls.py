@@ -14,8 +14,8 @@ SHORTFALLS: dict[str, str] = {
     "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
     "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
-        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{scene}-{precision}]": f"two boxes {what}, "
-        f"at rest to a micrometre, gain {gain} times the energy of a lift by their height, gate 0.01; none in steps up to 1 s, "
+        f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{scene}-{precision}]": f"two boxes "
+        f"{what}, at rest to a micrometre, gain {gain} times the energy of a lift, gate 0.01; none in steps up to 1 s, "
         "and boxes none with the converged solver"
         for scene, precision, what, gain in (
             ("10 and 100 s", "float32", "with a pendulum on one", 537),
