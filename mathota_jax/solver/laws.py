@@ -106,7 +106,8 @@ class Cone:
         row = impulse.ndim - 3  # axis of the rows: 0 for one turn, 1 for a whole table
         old_n, *old = unstack(impulse, row)
         error_n, *errors = unstack(error, row)
-        return self.with_friction(self.push(old_n, error_n), old, errors)
+        normal = self.push(old_n, error_n)
+        return jnp.stack([normal, *self.hold(normal, old, errors)], axis=row)
 
     def change(self, impulse: Array, error: Array) -> Array:
         """`update` less the old impulse, to the last digit of a small change of a large impulse."""
@@ -132,10 +133,6 @@ class Cone:
         free_1, free_2 = (part - error * self.tangent_mass for part, error in zip(old, errors, strict=True))
         scale = self._share(normal, free_1, free_2)
         return [free_1 * scale, free_2 * scale]
-
-    def with_friction(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> Array:
-        """All three rows for a new impulse of the normal row; `old` and `errors` are those of the tangents."""
-        return jnp.stack([normal, *self.hold(normal, old, errors)], axis=normal.ndim - 2)
 
     def _share(self, normal: Array, free_1: Array, free_2: Array) -> Array:
         """What friction leaves of tangential impulses: 1 where it holds."""
