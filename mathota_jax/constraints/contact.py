@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.bodies import InverseInertia, pack_blocks, smaller_moving
 from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet, stored
@@ -28,7 +28,14 @@ from mathota_jax.constraints.assembly import (
     smaller_side,
     turn_of_points,
 )
-from mathota_jax.constraints.effective_mass import first_grip, normal_bound, step_length, tangent_bound
+from mathota_jax.constraints.effective_mass import (
+    first_grip,
+    meeting,
+    normal_bound,
+    sliding_step,
+    step_length,
+    tangent_bound,
+)
 from mathota_jax.constraints.impact import Approach, impact, loaded, rebound
 from mathota_jax.constraints.mechanism_layout import contact_places
 from mathota_jax.model import Model
@@ -186,15 +193,27 @@ def contact_rows(
     active = compute_once(pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0], normal.x)
     # Empty columns of a table have no response.
     entries = step_length(scene, matrix).entries()
-    mass = safe_divide(active, normal_bound(entries, table.together, active))
+    size = pack_scalars(table, [smaller_side(table, take(model.size, scene.dynamic_bodies), places)], worlds)
+    slop = scene.options.slop * size
+    meets = active
+    if scene.options.solver != "soft_step":  # of which the lengths of steps are a part
+        lowest = pack_scalars(table, [_lowest(approach, model.dt)], worlds)[:, 0] - slop[:, 0]
+        meets = meeting(table.together, active, lowest)
+    mass = safe_divide(active, normal_bound(entries, table.together, active, meets))
     bias = [-target]
     if scene.friction:
         law = Cone(
             normal_mass=mass,
-            tangent_mass=safe_divide(active, tangent_bound(entries, table.together, active)),
+            tangent_mass=safe_divide(active, tangent_bound(entries, table.together, active, meets)),
             friction=pack_scalars(table, [_pair_friction(scene, table, model, pairs)], worlds)[:, 0],
-            first_grip=_first_grip(table, approach, active, model.dt) if scene.options.solver == "pgs" else None,
+            meets=meets,
+            first_grip=_first_grip(table, approach, meets, model.dt) if scene.options.solver == "pgs" else None,
         )
+        if scene.options.solver == "pgs" and couples_rotation(scene):
+            slip = lax.stop_gradient(matrix_velocity(table, matrix.other_rows(), places, motion.free_velocity))
+            stopped = pack_scalars(table, [jnp.maximum(target - free, 0.0)], worlds)[:, 0]
+            factor = sliding_step(entries, table.together, meets, law, lax.stop_gradient(stopped), slip)
+            law = dataclasses.replace(law, normal_mass=law.normal_mass * factor)
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
         law = push_only(mass[:, None])
@@ -205,7 +224,6 @@ def contact_rows(
         table=table,
         places=places,
     )
-    size = pack_scalars(table, [smaller_side(table, take(model.size, scene.dynamic_bodies), places)], worlds)
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     falling, load = None, None
     if scene.restitution and scene.options.solver != "soft_step":
@@ -222,7 +240,7 @@ def contact_rows(
         pack_scalars(table, [lever], worlds),
         directions,
         pack_scalars(table, [separation], worlds),
-        scene.options.slop * size,
+        slop,
         size,
         falling,
         load=load,
@@ -230,10 +248,19 @@ def contact_rows(
     )
 
 
-def _first_grip(table: Table | TracedTable, approach: Approach, active: Array, dt: Array) -> Array | None:
+def _first_grip(table: Table | TracedTable, approach: Approach, meets: Array, dt: Array) -> Array | None:
     """`first_grip` of the contacts whose points approach or part by no more than gravity does in a step."""
-    slow = jnp.where(jnp.abs(approach.start) <= norm(approach.gravity) * dt, 1.0, 0.0).astype(active.dtype)
-    return first_grip(table.together, active, pack_scalars(table, [slow], active.shape[-1])[:, 0])
+    slow = jnp.where(jnp.abs(approach.start) <= norm(approach.gravity) * dt, 1.0, 0.0).astype(meets.dtype)
+    return first_grip(table.together, meets, pack_scalars(table, [slow], meets.shape[-1])[:, 0])
+
+
+def _lowest(approach: Approach, dt: Array) -> Array:
+    """Lowest separation in a step if nothing held the bodies, less twice the way of gravity: what rests may push on.
+
+    Bodies that fall together do not approach each other, whatever holds the lower one.
+    """
+    speed = jnp.minimum(jnp.minimum(approach.start, approach.free), 0.0)
+    return approach.separation + dt * (speed - 2.0 * dt * norm(approach.gravity))
 
 
 def _points(

@@ -299,12 +299,13 @@ def _contact_group(group: Rows, members: _Class, delassus: Delassus, first: int)
     mass = of_points(law.normal_mass if isinstance(law, Cone) else law.effective_mass[:, 0])
     active = jnp.broadcast_to(jnp.where(mass > 0, 1.0, 0.0), (turns, points, own.shape[-1])).astype(own.dtype)
     entries = _entries(own)
-    normal = safe_divide(active, normal_bound(entries, points, active))
+    meets = active * of_points(law.meets) if isinstance(law, Cone) else active
+    normal = safe_divide(active, normal_bound(entries, points, active, meets))
     if not isinstance(law, Cone):
         return _group(_one_a_turn(turns, points), contact.push_only(normal[:, None]), bias, delassus, first)
-    tangent = safe_divide(active, tangent_bound(entries, points, active))
+    tangent = safe_divide(active, tangent_bound(entries, points, active, meets))
     grip = None if law.first_grip is None else of_points(law.first_grip)
-    law = Cone(normal, tangent, of_points(law.friction), grip)
+    law = Cone(normal, tangent, of_points(law.friction), meets, grip)
     return _group(_one_a_turn(turns, points), law, bias, delassus, first)
 
 

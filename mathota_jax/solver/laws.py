@@ -79,12 +79,14 @@ class Cone:
       normal_mass: effective mass of the normal row.
       tangent_mass: common effective mass of the tangent rows.
       friction: Coulomb coefficient.
+      meets: 1 for points by which those masses are measured, 0 for those that get there in this step only if pushed.
       first_grip: factor on the tangential steps of contacts that start without an impulse; None for 1.
     """
 
     normal_mass: Array
     tangent_mass: Array
     friction: Array
+    meets: Array
     first_grip: Array | None = None
 
     def starting(self, impulse: Array) -> Cone:
@@ -92,7 +94,7 @@ class Cone:
         if self.first_grip is None:
             return self
         longer = jnp.where(impulse[:, 0] > 0, 1.0, self.first_grip)
-        return Cone(self.normal_mass, self.tangent_mass * longer, self.friction)
+        return dataclasses.replace(self, tangent_mass=self.tangent_mass * longer, first_grip=None)
 
     def relaxed(self, factor: Array) -> Cone:
         """The same law with longer steps of the normal row, which do not move its fixed point; `factor` (column, world).

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from mathota_jax.solver import sweeps
@@ -22,9 +21,11 @@ from mathota_jax.solver.sweeps import Update
 from mathota_jax.spatial.settle import store
 from mathota_jax.struct import pytree
 
-LINEAR_RELAXATION = (1.5, 1.3, 1.3)
-"""Factors on the steps of the normal and tangent rows of contacts in the sweeps behind a derivative, which have no bounds
-that could make them swing."""
+NORMAL_RELAXATION, TANGENT_RELAXATION = (1.5, 1.2), (1.3, 1.0)
+"""Factors on the steps of the normals and of the tangents of contacts that stick and that slide, in the sweeps behind a
+derivative, which have no bounds that could make them swing. Tangents that slide follow the normals, and what they do to
+them adds to the steps of those. Measured for boxes that slide on an edge with friction 0.8: with the factors for contacts
+that stick, what a sweep leaves of the motion of a tower 1:2 grew, until derivatives were 68 for 2."""
 
 MOMENTUM = 0.15
 """Share of the change by the sweep before that is added to that of each of those (heavy ball: B. T. Polyak, "Some methods of
@@ -151,19 +152,20 @@ def _linear_sweeps(
     if not _accelerate(rows):
         return sweeps.run(iterations, rows, lambda _: update, coefficients, zeros, nothing, zeros)[1]
 
-    def longer(update: Callable[..., Array], rows: slice) -> Callable[..., Array]:
-        factors = np.array(LINEAR_RELAXATION)[rows, None, None]
+    def first(of_turn: tuple[ConeSlopes, Array], bias: Array, impulse: Array, error: Array) -> Array:
+        old = impulse[:1]
+        return old + _factor(of_turn[0], *NORMAL_RELAXATION) * (update.first(of_turn, bias, impulse, error) - old)
 
-        def relaxed(of_turn: object, bias: Array, impulse: Array, *errors: Array) -> Array:
-            old = impulse[rows]
-            return old + factors.astype(old.dtype) * (update(of_turn, bias, impulse, *errors) - old)
+    def others(of_turn: tuple[ConeSlopes, Array], bias: Array, impulse: Array, normal: Array, error: Array) -> Array:
+        old = impulse[1:]
+        return old + _factor(of_turn[0], *TANGENT_RELAXATION) * (
+            update.others(of_turn, bias, impulse, normal, error) - old
+        )
 
-        return relaxed
-
-    update = Update(update.at_once, longer(update.first, slice(0, 1)), longer(update.others, slice(1, None)))
+    longer = Update(update.at_once, first, others)
 
     def sweep(now: tuple, before: tuple) -> tuple:
-        new = sweeps.once(rows, update, coefficients, zeros, *now)
+        new = sweeps.once(rows, longer, coefficients, zeros, *now)
         return jax.tree.map(lambda x, a, b: x + MOMENTUM * (a - b), new, now, before)
 
     def two_sweeps(_: Array, carry: tuple) -> tuple:
@@ -174,6 +176,10 @@ def _linear_sweeps(
 
     start = (nothing, zeros)
     return lax.fori_loop(0, -(-iterations // 2), two_sweeps, (start, start))[0][1]
+
+
+def _factor(slopes: ConeSlopes, sticking: float, sliding: float) -> Array:
+    return jnp.where(slopes.grip < 1, sliding, sticking).astype(slopes.grip.dtype)
 
 
 def _accelerate(rows: tuple[Rows, ...]) -> bool:

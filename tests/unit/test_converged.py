@@ -71,7 +71,7 @@ def rows_of(jacobian, inverse_mass, friction):
         else:
             mass = arrange(effective)
             tangent = jnp.minimum(mass[:, 1], mass[:, 2]) / 2
-            law = Cone(mass[:, 0], tangent, jnp.full_like(tangent, friction))
+            law = Cone(mass[:, 0], tangent, jnp.full_like(tangent, friction), jnp.ones_like(tangent))
         bias = jnp.zeros((table.turn_count, jacobian.shape[1], table.column_count, 1))
         rows.append(Rows(Dense(tuple(sides), tuple(responses)), bias, law, table))
     return tuple(rows)

@@ -16,7 +16,7 @@ def law_of(kind, random):
         return jnp.asarray(random.uniform(low, high, (TURNS, *row, COLUMNS, WORLDS)))
 
     if kind == "cone":
-        return Cone(between(0.5, 1.5), between(0.5, 1.5), between(0.2, 0.8))
+        return Cone(between(0.5, 1.5), between(0.5, 1.5), between(0.2, 0.8), jnp.ones((TURNS, COLUMNS, WORLDS)))
     one = jnp.ones((TURNS, 1, COLUMNS, WORLDS))
     return Bounded(between(0.5, 1.5, 1), between(0.0, 0.5, 1), -one, one)
 
