@@ -111,7 +111,7 @@ def tangent_bound(entries: tuple[Entries, Entries], together: int, active: Array
     return jnp.where(meets > 0, *(compute_once(x / TANGENT_RELAXATION, active) for x in (total, apart)))
 
 
-def first_grip(together: int, active: Array, slow: Array) -> Array | None:
+def first_grip(together: int, meets: Array, slow: Array) -> Array | None:
     """`FIRST_GRIP` (turn, column, world) where it applies, else 1; None where it never does.
 
     `slow` is 1 for contacts that hardly approach: among others, which may hit anything at any speed, friction that
@@ -119,8 +119,7 @@ def first_grip(together: int, active: Array, slow: Array) -> Array | None:
     """
     if together < 3:
         return None
-    count = add_slices(active.reshape(active.shape[0], -1, together, active.shape[-1]), 2)
-    many = jnp.repeat(jnp.where(count > 2.0, 1.0, 0.0).astype(active.dtype), together, axis=1)
+    many = jnp.where(_over_points(meets, together) > 2.0, 1.0, 0.0).astype(meets.dtype)
     return 1.0 + (FIRST_GRIP - 1.0) * many * slow
 
 
