@@ -24,11 +24,6 @@ SHORTFALLS: dict[str, str] = {
             ("no joint, 30 and 100 s", "float64", "beside one that falls", 516),
         )
     },
-    **{
-        f"tests/physics/test_stiff_drives.py::test_derivative_of_a_crouch[{mode}-2000.0-0.025]": "3.2 %, gate 2.5 %: "
-        "the derivative is that of impulses that ten sweeps have not quite reached; by central differences 0.7 %"
-        for mode in ("jacfwd", "jacrev")
-    },
     "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
     "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "
     "stay so, gate 5 mm; 1 mm with the default solver",
