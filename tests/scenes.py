@@ -21,6 +21,14 @@ from mathota_jax import Box, Capsule, Fixed, Hinge, Options, Plane, SceneBuilder
 GRAVITY = 9.81
 DOWN = (0.0, -GRAVITY, 0.0)
 
+HALVES_BY_PROPORTION = {
+    "slab": (0.5, 0.05, 0.5),
+    "brick": (0.5, 0.3, 0.8),
+    "cube": (0.5, 0.5, 0.5),
+    "tower": (0.5, 1.0, 0.5),
+}
+"""Half extents [m] of boxes whose contacts turn them in different ways."""
+
 
 def undamped(**changes: Any) -> Options:
     """Options without the stabilising damping, which no closed form contains."""

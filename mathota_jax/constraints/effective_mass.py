@@ -74,13 +74,13 @@ def normal_bound(entries: tuple[Entries, Entries], together: int, active: Array,
     the trace of all: should they be pressed, too, nothing is multiplied by more than -1.
     """
     jacobian, response = entries
-    own = _largest_eigenvalue(jacobian, response, (0,))
+    own = compute_once(_largest_eigenvalue(jacobian, response, (0,)), active)
     if together == 1:
-        return compute_once(own, active)
+        return own
     every, points = (x.reshape(x.shape[0], -1, together, x.shape[-1]) for x in (active, meets))
     squared = _block(entries, together, 0, 0) ** 2 * (points[:, :, :, None] * points[:, :, None])
     norm = add_slices(add_slices(squared, 2), 2)
-    own = compute_once(own, active).reshape(points.shape)
+    own = own.reshape(points.shape)
     trace = add_slices(own * points, 2)
     rank = jnp.clip(add_slices(points, 2), 1.0, 3.0)
     bound = (trace + safe_sqrt(jnp.maximum((rank - 1.0) * (rank * norm - trace * trace), 0.0))) / rank
@@ -95,10 +95,9 @@ def tangent_bound(entries: tuple[Entries, Entries], together: int, active: Array
 
     A step must not overshoot at all here: what a friction impulse may be changes with the normal impulses.
     """
-    own = _largest_eigenvalue(*entries, (1, 2))
+    own = compute_once(_largest_eigenvalue(*entries, (1, 2)), active)
     if together == 1:
-        return compute_once(own, active)
-    own = compute_once(own, active)
+        return own
     # All in one kernel is not vectorised, and takes ten times as long.
     blocks = materialize([_block(entries, together, row, column) for row in (1, 2) for column in (1, 2)])
     squared = functools.reduce(jnp.add, [part**2 for part in blocks])

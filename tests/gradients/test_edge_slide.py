@@ -14,14 +14,8 @@ import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, step
 from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
-from tests.scenes import DOWN, GRAVITY, undamped
+from tests.scenes import DOWN, GRAVITY, HALVES_BY_PROPORTION, undamped
 
-HALVES = {
-    "slab": (0.5, 0.05, 0.5),
-    "brick": (0.5, 0.3, 0.8),
-    "cube": (0.5, 0.5, 0.5),
-    "tower": (0.5, 1.0, 0.5),
-}
 FRICTION, FALL, DT = 0.8, 0.2, 1 / 240
 
 
@@ -77,18 +71,18 @@ derivatives = {mode: jax.jit(getattr(jax, mode)(motion_of_step, has_aux=True)) f
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.parametrize("tilt", [0.02, 0.3])
 @pytest.mark.parametrize("speed", [3.0, -3.0])
-@pytest.mark.parametrize("name", slow_but(("slab", "brick", "tower"), HALVES))
+@pytest.mark.parametrize("name", slow_but(("slab", "brick", "tower"), HALVES_BY_PROPORTION))
 def test_a_step(precision, name, speed, tilt, gate):
     """Sweeps that answered to friction as if it followed by itself swung: derivatives of the tower were 68 for 2."""
-    model, state, edge = on_its_edge(HALVES[name], tilt)
+    model, state, edge = on_its_edge(HALVES_BY_PROPORTION[name], tilt)
     parameters = (
         jnp.asarray([speed, -FALL, 0.0], precision),
         jnp.asarray(FRICTION, precision),
         jnp.ones((), precision),
     )
-    exact = truth(parameters, HALVES[name], edge)
+    exact = truth(parameters, HALVES_BY_PROPORTION[name], edge)
     assert abs(float(exact[0] / speed) - 1) < 0.3, "it goes on sliding"
-    slopes = jax.jacfwd(truth)(parameters, HALVES[name], edge)
+    slopes = jax.jacfwd(truth)(parameters, HALVES_BY_PROPORTION[name], edge)
     for mode, derivative in derivatives.items():
         found, value = derivative(parameters, model, state)
         gate("velocity / fall", (value - exact) / FALL, 0.02)

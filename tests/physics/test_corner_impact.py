@@ -14,14 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from mathota_jax import Box, Plane, SceneBuilder, step
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.scenes import DOWN, GRAVITY, box_moments, repeat, undamped
+from tests.scenes import DOWN, GRAVITY, HALVES_BY_PROPORTION, box_moments, repeat, undamped
 
-HALVES = {
-    "slab": (0.5, 0.05, 0.5),
-    "brick": (0.5, 0.3, 0.8),
-    "cube": (0.5, 0.5, 0.5),
-    "tower": (0.5, 1.0, 0.5),
-}
 FRICTION, APPROACH, DT, IMPACTS = 0.8, 2.0, 1 / 240, 64
 SIGNS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 DOWNWARD = np.array([0.0, -GRAVITY * DT, 0.0])
@@ -53,10 +47,10 @@ def sticking_impacts(half):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("name", HALVES)
+@pytest.mark.parametrize("name", HALVES_BY_PROPORTION)
 def test_ten_sweeps_come_close(precision, name, gate):
     """Of the speed of approach, 2 m/s. Steps short enough for all four corners left 12 to 15 % of it, 34 % at most."""
-    half = HALVES[name]
+    half = HALVES_BY_PROPORTION[name]
     builder = SceneBuilder(gravity=DOWN)
     builder.add_body(Plane((0, 1, 0)), static=True, friction=FRICTION)
     builder.add_body(Box(half), mass=1.0, friction=FRICTION)

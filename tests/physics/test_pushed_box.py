@@ -14,14 +14,8 @@ import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, step
 from tests.marks import QUICK_AND_SLOW_PRECISION
-from tests.scenes import DOWN, GRAVITY, advance, undamped
+from tests.scenes import DOWN, GRAVITY, HALVES_BY_PROPORTION, advance, undamped
 
-HALVES = {
-    "slab": (0.5, 0.05, 0.5),
-    "brick": (0.5, 0.3, 0.8),
-    "cube": (0.5, 0.5, 0.5),
-    "tower": (0.5, 1.0, 0.5),
-}
 FRICTION = 0.5
 LOAD = np.array([0.3, 0.0, 0.2, 0.02, 0.0, -0.03])
 """Force [N/kg] and torque [N m/kg] per length of the body, a tenth of what friction and the narrowest face bear."""
@@ -62,17 +56,17 @@ def put_down_askew(model, state, gate):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("name", HALVES)
+@pytest.mark.parametrize("name", HALVES_BY_PROPORTION)
 def test_it_stays_at_rest(precision, name, gate):
     """Of the speed that the load alone would give it, 7 to 10 mm/s in two steps."""
-    model, state = on_plane(HALVES[name])
+    model, state = on_plane(HALVES_BY_PROPORTION[name])
     gate("speed [m/s, rad/s]", motion(jnp.asarray(LOAD, precision), model, state), 2e-4)
 
 
-@pytest.mark.parametrize("name", HALVES)
+@pytest.mark.parametrize("name", HALVES_BY_PROPORTION)
 def test_its_derivatives_are_zero(float64, name, gate):
     """Free, they are dt / mass = 0.033 and more."""
-    model, state = on_plane(HALVES[name])
+    model, state = on_plane(HALVES_BY_PROPORTION[name])
     gate("forward", forward(jnp.asarray(LOAD), model, state), 1e-5)
     gate("reverse", reverse(jnp.asarray(LOAD), model, state), 1e-5)
 
@@ -81,7 +75,7 @@ def test_its_derivatives_are_zero(float64, name, gate):
 @pytest.mark.parametrize("sweeps", [10, 40, pytest.param(160, marks=pytest.mark.slow)])
 def test_more_sweeps_do_not_shake_a_cube(precision, sweeps, gate):
     """Put down tilted by a microradian it lies flat, within what the sweeps leave: 40 shook it by 2 mrad."""
-    model, state = on_plane(HALVES["cube"], velocity_iterations=sweeps)
+    model, state = on_plane(HALVES_BY_PROPORTION["cube"], velocity_iterations=sweeps)
     final = put_down_askew(model, state, gate)
     gate("speed [m/s]", final.velocity[1], 1e-5)
 
