@@ -46,9 +46,11 @@ def test_gaussian_agrees_with_scipy():
 
 def test_learns_the_optimal_action():
     environment = MatchTarget()
-    untrained = PPO(environment, SMALL)
+    # With steps as long at the end as at the start the return depends on round-off: 7.2 to 7.9 of 8.
+    annealed = replace(SMALL, anneal=True)
+    untrained = PPO(environment, annealed)
     before = evaluate(untrained.policy(untrained.initial_state(0)), environment)
-    policy = train(environment, SMALL, seed=0, report=ignore, should_stop=ignore)
+    policy = train(environment, annealed, seed=0, report=ignore, should_stop=ignore)
     after = evaluate(policy, environment)
     optimum = environment.max_episode_steps
     assert before.returns.mean() < 0.3 * optimum

@@ -1,14 +1,15 @@
-"""What is stored in reverse mode, and what is not."""
+"""One computation for one decision; what is stored in reverse mode, and what is not."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.test_util import check_grads
 
 from mathota_jax.bodies import Inertia
 from mathota_jax.dynamics.free_motion import PARTS, rotate_at_constant_momentum
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
-from mathota_jax.spatial.settle import store_cotangents
+from mathota_jax.spatial.settle import settle, store_cotangents
 from mathota_jax.spatial.vector import Vec3
 
 
@@ -20,6 +21,27 @@ def product(matrix, vector):
 def arguments():
     random = np.random.default_rng(0)
     return jnp.asarray(random.normal(size=(4, 3))), jnp.asarray(random.normal(size=(3, 5)))
+
+
+def disagreement(cure, precision):
+    """Share of the comparisons of a product with its own rounded value that two outputs of one program take differently."""
+    x, y = np.random.default_rng(0).uniform(1.0, 2.0, size=(2, 4096)).astype(precision)
+
+    @jax.jit
+    def outputs(x, y, rounded, zero):
+        product = x * y
+        decision = cure(jnp.where(product - rounded - zero > 0, 1.0, 0.0).astype(precision))
+        # The second kernel needs the product itself, and so does not contract it with the difference.
+        return jnp.where(decision > 0.5, x, -x), jnp.where(decision > 0.5, product, -product)
+
+    first, second = outputs(x, y, x * y, np.zeros_like(x))
+    return np.mean(np.sign(first) != np.sign(second))
+
+
+def test_a_decision_falls_one_way_in_all_kernels(precision):
+    if disagreement(lambda decision: decision, precision) < 0.1:
+        pytest.skip("here no product is contracted with a sum: the cure has nothing to cure")
+    assert disagreement(settle, precision) == 0
 
 
 def test_values_and_derivatives_of_any_order_are_unchanged(float64):
