@@ -41,20 +41,20 @@ def hull(points):
 
 def point_to_hull(point, vertices, faces):
     """Signed distance by enumerating corners, edges and planes of the triangulated faces."""
-    planes, best = [], np.inf
-    for face in faces:
-        a = vertices[face[0]]
-        for second, third in itertools.pairwise(face[1:]):
-            b, c = vertices[second], vertices[third]
-            normal = np.cross(b - a, c - a)
-            if np.linalg.norm(normal) < 1e-12 * np.abs(vertices).max() ** 2:
-                continue
-            normal /= np.linalg.norm(normal)
-            planes.append(normal @ (point - a))
-            shares = np.linalg.solve(np.stack([b - a, c - a, normal], 1), point - a)
-            if shares[0] >= 0 and shares[1] >= 0 and shares[0] + shares[1] <= 1:
-                best = min(best, abs(shares[2]))
-            for start, end in ((a, b), (b, c), (c, a)):
-                t = np.clip((point - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
-                best = min(best, np.linalg.norm(point - start - t * (end - start)))
-    return max(planes) if max(planes) <= 0 else best
+    triangles = [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
+    corners = vertices[np.array(triangles)]
+    sides = np.roll(corners, -1, axis=1) - corners
+    normals = np.cross(sides[:, 0], -sides[:, 2])
+    lengths = np.linalg.norm(normals, axis=1)
+    # Faces are padded with their last corner.
+    proper = lengths > 1e-12 * np.abs(vertices).max() ** 2
+    corners, sides, normals = corners[proper], sides[proper], normals[proper] / lengths[proper, None]
+    heights = np.sum((point - corners[:, 0]) * normals, axis=1)
+    if heights.max() <= 0:
+        return heights.max()
+    axes = np.stack([sides[:, 0], -sides[:, 2], normals], axis=2)
+    shares = np.linalg.solve(axes, (point - corners[:, 0])[..., None])[:, :2, 0]
+    over = (shares >= 0).all(1) & (shares.sum(1) <= 1)
+    along = np.clip(np.sum((point - corners) * sides, axis=2) / np.sum(sides**2, axis=2), 0, 1)
+    to_edges = np.linalg.norm(point - corners - along[..., None] * sides, axis=2)
+    return min(np.abs(heights[over]).min(initial=np.inf), to_edges.min())

@@ -356,8 +356,10 @@ def overlap_contact(vertices_a, faces_a, vertices_b, faces_b):
     axes = []
     for vertices, faces in ((vertices_a, faces_a), (vertices_b, faces_b)):
         axes += [np.cross(vertices[f[1]] - vertices[f[0]], vertices[f[2]] - vertices[f[0]]) for f in faces]
-    axes += [np.cross(e, f) for e in edges_of(vertices_a, faces_a) for f in edges_of(vertices_b, faces_b)]
-    axes = np.array([x / np.linalg.norm(x) for x in axes if np.linalg.norm(x) > 1e-6])
+    edges_a, edges_b = edges_of(vertices_a, faces_a), edges_of(vertices_b, faces_b)
+    axes = np.concatenate([axes, np.cross(edges_a[:, None], edges_b).reshape(-1, 3)])
+    lengths = np.linalg.norm(axes, axis=1)
+    axes = axes[lengths > 1e-6] / lengths[lengths > 1e-6, None]
     axes = np.concatenate([axes, -axes])
     gaps = (vertices_b @ axes.T).min(0) - (vertices_a @ axes.T).max(0)
     best = np.argmax(gaps)
