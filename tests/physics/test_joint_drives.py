@@ -20,7 +20,7 @@ from mathota_jax import (
     joint_position,
     joint_velocity,
 )
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_IN_FLOAT64
 from tests.scenes import DOWN, GRAVITY, record_worlds, stack, undamped, with_dt
 
 STEPS, STEP_SIZES = 480, (1 / 240, 1 / 120)
@@ -117,7 +117,7 @@ def oscillator(time, stiffness, damping, inertia, rest=REST):
     [("spring", 50.0, MASS, REST), ("geared", 50.0, MASS + 6.0, REST), ("torsion", 2.0, INERTIA + 0.1, 0.5)],
 )
 @pytest.mark.parametrize("world", [0, 1])
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_undamped_spring_is_exact(precision, name, stiffness, inertia, rest, world, gate):
     """Frequency ``sqrt(k / (m + armature))``, amplitude and phase, at any step."""
     time, found = of(precision, name, world)
@@ -143,7 +143,7 @@ def test_damped_spring_is_of_second_order(float64, name, stiffness, damping, gat
 
 @pytest.mark.parametrize("name", ["rigid", "rigid and damped"])
 @pytest.mark.parametrize("world", [0, 1])
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_spring_of_any_stiffness_comes_to_rest(precision, name, world, gate):
     _, found = of(precision, name, world)
     gate("place at the end / rest - 1", found["place"][-1] / REST - 1, 1e-5)
@@ -151,7 +151,7 @@ def test_spring_of_any_stiffness_comes_to_rest(precision, name, world, gate):
     gate("after sixty steps / rest - 1", found["place"][60:] / REST - 1, 1e-4)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_spring_carries_its_load(precision, gate):
     _, found = of(precision, "loaded")
     gate("sag / (m g / k) - 1", found["place"][-1] / (-WEIGHT / 400.0) - 1, 1e-4)
@@ -160,7 +160,7 @@ def test_spring_carries_its_load(precision, gate):
 @pytest.mark.parametrize(
     ("name", "rate", "friction", "inertia"), [("brake", 1.5, 4.0, MASS), ("wheel", 2.0, 0.05, INERTIA)]
 )
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_dry_friction_stops_a_wheel(precision, name, rate, friction, inertia, gate):
     """``w0 - F t / I`` until ``t = I w0 / F``, then rest."""
     time, found = of(precision, name)
@@ -170,7 +170,7 @@ def test_dry_friction_stops_a_wheel(precision, name, rate, friction, inertia, ga
     gate("way / (I w0^2 / 2 F) - 1", found["place"][-1] / (inertia * rate**2 / (2 * friction)) - 1, 1e-3)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_dry_friction_under_load(precision, gate):
     time, slips = of(precision, "slips")
     gate("slipping / truth - 1", slips["rate"] / (-(WEIGHT - 5.0) / MASS * time) - 1, 1e-4)
@@ -178,7 +178,7 @@ def test_dry_friction_under_load(precision, gate):
 
 
 @pytest.mark.parametrize(("name", "inertia"), [("drive", INERTIA), ("geared drive", 2 * INERTIA)])
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_velocity_motor_reaches_its_target_with_its_cap(precision, name, inertia, gate):
     """The action 1 times the gear 2 is reached at ``t = 2 I / cap``."""
     time, found = of(precision, name)
@@ -186,7 +186,7 @@ def test_velocity_motor_reaches_its_target_with_its_cap(precision, name, inertia
     gate("rate", found["rate"] - truth, {"float64": 1e-6, "float32": 1e-4}[str(precision)])
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_velocity_motor_under_load(precision, gate):
     time, stalls = of(precision, "stalls")
     gate("overloaded: rate / truth - 1", stalls["rate"] / (-(WEIGHT - 10.0) / MASS * time) - 1, 1e-4)
@@ -196,7 +196,7 @@ def test_velocity_motor_under_load(precision, gate):
     gate("lifting: force / weight - 1", lifts["force"][60:, 1] / WEIGHT - 1, 1e-3)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_position_servo_under_load(precision, gate):
     """``k (q - q*)`` is the load; capped, the load wins."""
     gate("error / (m g / k) - 1", (of(precision, "servo")[1]["place"][-1] - 0.2) / (-WEIGHT / 400.0) - 1, 1e-4)
@@ -206,14 +206,14 @@ def test_position_servo_under_load(precision, gate):
     gate("rigid: place / target - 1", rigid["place"][60:] / 0.2 - 1, 1e-4)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_servo_turns_the_short_way(precision, gate):
     """A target of 3.5 rad is -2.78 rad round the other way."""
     _, found = of(precision, "far servo")
     gate("place at the end [rad]", found["place"][-1] - (3.5 - 2 * np.pi), 1e-3)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_tension_of_a_pendulum(precision, gate):
     """``m g (3 cos a - 2 cos a0)`` along the rod, at the middle of the step."""
     _, found = of(precision, "tension")
@@ -227,7 +227,7 @@ def test_tension_of_a_pendulum(precision, gate):
     gate("torque [N m]", found["torque"], 1e-6)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_cantilever(precision, gate):
     """The weld carries ``m g`` and ``m g l`` about its anchor."""
     _, found = of(precision, "cantilever")
@@ -235,7 +235,7 @@ def test_cantilever(precision, gate):
     gate("torque / (weight times arm)", found["torque"][-1] / (WEIGHT * LEVER) - np.array([0, 0, 1]), 1e-4)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_reactions_of_idle_joints(precision, gate):
     """A slider along x carries the weight; what sticks is held by the friction alone."""
     gate("slider: force / weight", of(precision, "brake")[1]["force"][-1] / WEIGHT - np.array([0, 1, 0]), 1e-4)
