@@ -27,9 +27,6 @@ SHORTFALLS: dict[str, str] = {
     "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
     "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "
     "stay so, gate 5 mm; 1 mm with the default solver",
-    "tests/physics/test_impact_events.py::test_a_ball_dropped_by_little_gains_no_energy[0.016666666666666666-0.8]": "of 40 "
-    "balls that fall by less than a millimetre 2 end a step up to 0.6 mm in the plane and are pushed out: 0.03 of "
-    "the first energy in a step, gate 1e-3; none in longer steps",
     "tests/gradients/test_slide_gradient.py::test_a_spinning_box_that_just_touches": "the derivative by the mass is 7 % too "
     "large, that by the height and the position without bound: of four corners at the height 0 to round-off some carry "
     "none of the load, and their shares are undetermined; right for one step, and where the box is pressed in by 5 um",

@@ -60,13 +60,13 @@ class Foreseen(NamedTuple):
     Attributes:
       apart: what a step that is split leaves to the search, since it meets at speed or is apart.
       clear: what no contact row should touch: it parts at speed and does not meet again, or flies past.
-      returns: what touches, leaves and meets again.
-      target, lever: for those that return, the velocity to reach in the end [m/s] and the lever of the impulse [s].
+      leaves: what touches and leaves, for good or to meet again.
+      target, lever: for those that leave, the velocity to reach in the end [m/s] and the lever of the impulse [s].
     """
 
     apart: Array
     clear: Array
-    returns: Array
+    leaves: Array
     target: Array
     lever: Array
 
@@ -117,37 +117,41 @@ def foreseen(
             group.separation > SPECULATIVE * group.size
         )
         clear = settle(jnp.where((fast & (start > 0) & (time > left)) | flies_past, 1.0, 0.0)) > 0.5
-        found.append(Foreseen(meets | followed, clear, *_return(exact[0], exact_group, *exact[2:], fast)))
+        found.append(Foreseen(meets | followed, clear, *_leave(exact[0], exact_group, *exact[2:], fast)))
         bounces = bounces | (meets & (e > 0)).any((0, 1, 2))
     return tuple(found), bounces
 
 
-def _return(
+def _leave(
     model: Model, group: ContactRows, now: Array, then: Array, left: Array, fast: Array
 ) -> tuple[Array, Array, Array]:
-    """Which contacts touch, leave and come back, the velocity to reach, and the lever of the impulse.
+    """Which contacts touch and leave, the velocity to reach, and the lever of the impulse.
 
-    They rebound once more if they come back at speed and are in flight at the end. Else they end where they touched:
-    their own impacts are over by then, or too many to follow.
+    Those that do not come back are stopped by nothing, unless something presses them back: no further than to where they
+    touched. Those that do rebound once more if they come back at speed and are in flight at the end. Else they end where they
+    touched: their own impacts are over by then, or too many to follow.
     """
     start, free = (first_row_velocity(group.rows, v) for v in (now, then))
     acceleration = (free - start) / left
-    comes_back = (group.separation <= 0) & (start > 0) & (start + free < 0)
+    leaves = (group.separation <= 0) & (start > 0)
+    comes_back = leaves & (start + free < 0)
     time = jnp.where(comes_back, -2.0 * start / jnp.where(comes_back, acceleration, 1.0), 0.0)
     velocity = _restitution(model, group.rows, now.shape[-1]) * start + acceleration * (left - time)
     rebounds = comes_back & fast & (velocity > 0)
-    lever = jnp.where(rebounds, left - time, 0.5 * left * (1.0 + start / jnp.where(comes_back, free, -1.0)))
-    chosen = settle(jnp.where(comes_back, 1.0, 0.0) + jnp.where(rebounds, 1.0, 0.0))
-    return chosen > 0.5, jnp.where(chosen > 1.5, velocity, 0.0), lever
+    chosen = settle(sum(jnp.where(condition, 1.0, 0.0) for condition in (leaves, comes_back, rebounds)))
+    target = jnp.where(chosen > 2.5, velocity, jnp.where(chosen > 1.5, 0.0, -start))
+    stopped = 0.5 * left * (1.0 + start / jnp.where(comes_back, free, -1.0))
+    lever = jnp.where(chosen > 2.5, left - time, jnp.where(chosen > 1.5, stopped, 0.5 * left))
+    return chosen > 0.5, target, lever
 
 
 def corrected(group: ContactRows, found: Foreseen, split: Array) -> tuple[ContactRows, Array]:
     """Rows of the contacts that count in this part of a step, and which do not; `split` (world,) if an impact ends it."""
     dropped = (found.apart & split) | found.clear
-    returns = found.returns & ~split
-    first = jnp.where(returns, -found.target, group.rows.bias[:, :1])
+    leaves = found.leaves & ~split
+    first = jnp.where(leaves, -found.target, group.rows.bias[:, :1])
     rows = with_first_bias(group.rows, first)
-    lever = jnp.where(returns, found.lever, group.lever)
+    lever = jnp.where(leaves, found.lever, group.lever)
     falling = group.falling
     if falling is not None:
         falling = falling * safe_divide(lever, group.lever)
