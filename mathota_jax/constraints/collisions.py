@@ -128,8 +128,8 @@ def _leave(
     """Which contacts touch and leave, the velocity to reach, and the lever of the impulse.
 
     Those that do not come back are stopped by nothing, unless something presses them back: no further than to where they
-    touched. Those that do rebound once more if they come back at speed and are in flight at the end. Else they end where they
-    touched: their own impacts are over by then, or too many to follow.
+    touched. Those that do rebound once more if they come back at speed and are in flight at the end. Else they end where
+    they touched: their own impacts are over by then, or too many to follow.
     """
     start, free = (first_row_velocity(group.rows, v) for v in (now, then))
     acceleration = (free - start) / left
@@ -138,7 +138,7 @@ def _leave(
     time = jnp.where(comes_back, -2.0 * start / jnp.where(comes_back, acceleration, 1.0), 0.0)
     velocity = _restitution(model, group.rows, now.shape[-1]) * start + acceleration * (left - time)
     rebounds = comes_back & fast & (velocity > 0)
-    chosen = settle(sum(jnp.where(condition, 1.0, 0.0) for condition in (leaves, comes_back, rebounds)))
+    chosen = settle(jnp.where(leaves, 1.0, 0.0) + jnp.where(comes_back, 1.0, 0.0) + jnp.where(rebounds, 1.0, 0.0))
     target = jnp.where(chosen > 2.5, velocity, jnp.where(chosen > 1.5, 0.0, -start))
     stopped = 0.5 * left * (1.0 + start / jnp.where(comes_back, free, -1.0))
     lever = jnp.where(chosen > 2.5, left - time, jnp.where(chosen > 1.5, stopped, 0.5 * left))

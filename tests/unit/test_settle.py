@@ -29,10 +29,10 @@ def disagreement(cure, precision):
 
     @jax.jit
     def outputs(x, y, rounded, zero):
-        product = x * y
-        decision = cure(jnp.where(product - rounded - zero > 0, 1.0, 0.0).astype(precision))
+        xy = x * y
+        decision = cure(jnp.where(xy - rounded - zero > 0, 1.0, 0.0).astype(precision))
         # The second kernel needs the product itself, and so does not contract it with the difference.
-        return jnp.where(decision > 0.5, x, -x), jnp.where(decision > 0.5, product, -product)
+        return jnp.where(decision > 0.5, x, -x), jnp.where(decision > 0.5, xy, -xy)
 
     first, second = outputs(x, y, x * y, np.zeros_like(x))
     return np.mean(np.sign(first) != np.sign(second))
