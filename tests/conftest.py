@@ -11,7 +11,6 @@ import jax
 import numpy as np
 import pytest
 
-from tests.long_tests import LONG
 from tests.marks import QUICK_COMPILER
 from tests.shortfalls import SHORTFALLS, TIMINGS
 
@@ -40,13 +39,9 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
-@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks what takes long as slow, and the gates that are not met yet as strict expected failures."""
+    """Marks the gates that are not met yet as strict expected failures."""
     for item in items:
-        function, _, variant = item.nodeid.partition("[")
-        if variant.removesuffix("]") in LONG.get(function, ()):
-            item.add_marker(pytest.mark.slow)
         for prefix, reason in {**SHORTFALLS, **TIMINGS}.items():
             if item.nodeid == prefix or item.nodeid.startswith(prefix + "["):
                 item.add_marker(pytest.mark.xfail(strict=prefix in SHORTFALLS, reason=reason))

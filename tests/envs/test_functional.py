@@ -11,6 +11,7 @@ import pytest
 import mathota_envs
 from mathota_envs import ENVIRONMENTS, EnvState, make
 from mathota_envs.worlds import start_world, start_worlds, step_world, step_worlds
+from tests.marks import slow_but
 
 EVERY_ID = pytest.mark.parametrize("id", ENVIRONMENTS)
 
@@ -48,7 +49,7 @@ def test_starts_follow_from_the_key_and_differ_between_keys(id):
     assert not (restarted == observations).all(axis=1).any(), "the second episode must start elsewhere"
 
 
-@EVERY_ID
+@pytest.mark.parametrize("id", slow_but(("mathota/BallBalance-v0",), ENVIRONMENTS))
 def test_a_batch_agrees_with_single_worlds(id):
     environment = make(id)
     batch = start_worlds(environment, keys(3))
@@ -149,7 +150,7 @@ def test_a_non_finite_world_terminates_and_leaves_the_others_bitwise_alone(id):
     assert not expected.terminated.any()
 
 
-@EVERY_ID
+@pytest.mark.parametrize("id", slow_but(("mathota/InvertedPendulum-v0",), ENVIRONMENTS))
 def test_the_model_can_be_replaced_in_a_step(id):
     environment = make(id)
     env_state = start_world(environment, jax.random.key(0)).env_state

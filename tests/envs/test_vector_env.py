@@ -11,6 +11,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from mathota_envs import ENVIRONMENTS, GymEnv, GymVectorEnv
 from tests.envs.counting import Counting
+from tests.marks import slow_but
 
 EVERY_ID = pytest.mark.parametrize("id", ENVIRONMENTS)
 EVERY_MODE = pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -155,7 +156,7 @@ def _arrays(result):
             yield from (entry for entry in part if entry is not None)
 
 
-@EVERY_ID
+@pytest.mark.parametrize("id", slow_but(("mathota/InvertedPendulum-v0",), ENVIRONMENTS))
 def test_registered_vector_environment_equals_single_environments(id):
     assert gymnasium.make_vec(id, 3).metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     vector = gymnasium.make_vec(id, 3, autoreset_mode="SameStep")

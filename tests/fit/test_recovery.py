@@ -27,6 +27,7 @@ from tests.fit.scenes import (
     unknown,
 )
 from tests.gradients.bystanders import add_bystanders
+from tests.marks import slow_but
 from tests.scenes import undamped
 
 
@@ -162,7 +163,7 @@ def starts_around(vector):
     )
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", slow_but((0,), (0, 2)))
 def test_friction_restitution_mass_and_size(throw_objective, seed, gate):
     """Each to 1 % from positions with 1 mm and orientations with 1 degree of noise, from starts 10 % to 15 % away."""
     data = noisy(clean_throws(), seed, with_velocity=True)

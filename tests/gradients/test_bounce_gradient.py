@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Sphere, apply_force, rollout
+from tests.marks import QUICK_IN_FLOAT64
 from tests.scenes import body_on_plane, undamped
 
 RADIUS = 0.1
@@ -74,6 +75,7 @@ def check(gate, slopes, truth, limit):
 
 
 @pytest.mark.parametrize("dt", [1 / 240, 1 / 480])
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_one_bounce_without_gravity(precision, dt, gate):
     value, slopes = run(height=1.0, velocity=-2.0, restitution=1.0, gravity=0.0, time=1.0, dt=dt)
     gate("height / truth - 1", value / 1.2 - 1, 1e-3)
@@ -94,6 +96,7 @@ UNDER_GRAVITY = {
 
 
 @pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_one_bounce_under_gravity(precision, dt, gate):
     """Ignoring the time of impact gives d/dy0 = +1.0; correcting the position only gives -0.8; the truth is +0.76."""
     value, slopes = run(height=1.0, velocity=0.0, restitution=0.8, gravity=G, time=0.8, dt=dt)
@@ -110,6 +113,7 @@ SEVERAL_BOUNCES = [
 
 
 @pytest.mark.parametrize(("bounces", "time", "height", "by_restitution", "by_drop"), SEVERAL_BOUNCES)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_several_bounces(precision, bounces, time, height, by_restitution, by_drop, gate):
     value, slopes = run(height=1.0 + RADIUS, velocity=0.0, restitution=0.8, gravity=G, time=time, dt=1 / 240)
     gate(f"N={bounces}: gap / truth - 1", (value - RADIUS) / height - 1, 1e-2)

@@ -10,6 +10,7 @@ import pytest
 
 from mathota_jax import Plane, SceneBuilder, Sphere, step
 from mathota_jax.gradients import long_rollout, smoothed_step
+from tests.marks import QUICK_IN_FLOAT64
 from tests.scenes import undamped
 
 RADIUS, SPEED, RESTITUTION = 0.1, 2.0, 0.5
@@ -37,6 +38,7 @@ def target_speed(height, model, state, reach):
     return jax.value_and_grad(speed)(height)
 
 
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_a_miss_has_a_useful_gradient(precision):
     """The hard slope is 0 where the ball misses; the smoothed one leads from the miss to a hit in the middle, whose exact
     speed after it is (1 + e) v / 4."""

@@ -129,6 +129,7 @@ def test_a_wide_gap_that_hardly_closes(speed):
     assert np.isfinite(np.asarray(jax.jacrev(lambda start: jnp.stack(lever(start)))(speed))).all()
 
 
+@pytest.mark.slow
 def test_a_joint_that_hardly_resists():
     """The softness of a spring, damper or rotor is the reciprocal of what vanishes here; of all, then of each alone."""
     resisting = ("joint_damping", "joint_stiffness", "joint_armature", "joint_friction")

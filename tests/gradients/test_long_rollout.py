@@ -10,7 +10,7 @@ import pytest
 
 from mathota_jax import SceneBuilder, Slider, Sphere, rollout
 from mathota_jax.gradients import clip_cotangent, long_rollout
-from tests.marks import QUICK_IN_FLOAT64
+from tests.marks import QUICK_IN_FLOAT64, slow_but
 from tests.scenes import body_on_plane, undamped
 
 DT, STEPS = 1 / 60, 25
@@ -56,7 +56,7 @@ def assert_close(a, b, tolerance):
             np.testing.assert_allclose(x, y, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("segment", [None, 7, 100])
+@pytest.mark.parametrize("segment", slow_but((7, 100), (None, 7, 100)))
 @pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_same_values_and_gradients_as_rollout(precision, segment):
     """25 steps in five segments of five, in three of seven and a rest of four, in one."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import SceneBuilder, Sphere
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import advance, undamped, with_dt
 
 
@@ -37,6 +38,7 @@ def test_oblique_collision(precision, dt, gate):
     gate(f"positions after 1 s, dt {dt:.4f} [m]", final.position - truth, 1e-3)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_cradle_passes_the_whole_velocity_on(precision, gate):
     model, state = cradle(1e-3, impact_events=3)  # a ball needs 1 ms for a gap: up to four impacts in a step
     final = advance(model, state, 24)

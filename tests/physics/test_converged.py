@@ -38,7 +38,16 @@ def two_cubes(ratio):
     return builder.build(converged(dt=1 / 60))
 
 
-@pytest.mark.parametrize("dt", [1e-3, 1 / 60])
+@pytest.mark.parametrize(
+    ("precision", "dt"),
+    [
+        ("float32", 1e-3),
+        ("float32", 1 / 60),
+        pytest.param("float64", 1e-3, marks=pytest.mark.slow),
+        ("float64", 1 / 60),
+    ],
+    indirect=["precision"],
+)
 def test_heavy_cube_on_a_light_one(precision, dt, gate):
     """Benchmark B1: sink at most 1 % of the side, drift at most 1 mm, for mass ratios that defeat sweeps."""
     ratios = RATIOS[str(precision)]
@@ -151,6 +160,7 @@ def test_slip_derivative_is_exact(precision, gate):
     gate("slipping: dv/dmu / truth - 1", by_friction[slips] / -GRAVITY - 1.0, 1e-3)
 
 
+@pytest.mark.slow
 def test_scenes_with_a_broadphase(float64, gate):
     """Pairs found in each step lead to the same motion as pairs that have their own slots."""
     finals = []

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Plane, SceneBuilder, Sphere
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import advance_worlds, motion, record_worlds, repeat, undamped
 
 WORLDS, DT, RADIUS = 64, 1 / 60, 0.5
@@ -43,6 +44,7 @@ def into_the_corner(seed):
 
 @pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
 @pytest.mark.parametrize("walls", [2, 3])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_ball_flies_into_a_corner(precision, walls, restitution, gate):
     """Without friction each axis is alone: the gap closes at speed u and opens at e u, whatever the others do."""
     gap, speed = into_the_corner(walls)

@@ -23,7 +23,7 @@ from mathota_jax import (
     step,
 )
 from tests.benchmarks import hard_scenes
-from tests.marks import slow_but
+from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64
 from tests.scenes import (
     advance,
     body_on_plane,
@@ -94,7 +94,8 @@ def test_a_sphere_never_passes_a_wall(continuous, half):
     assert not escapes(model, states).any()
 
 
-@pytest.mark.parametrize("half", [0.1, pytest.param(5e-4, marks=pytest.mark.slow)], ids=["0.2 m", "1 mm"])
+@pytest.mark.slow
+@pytest.mark.parametrize("half", [0.1, 5e-4], ids=["0.2 m", "1 mm"])
 @pytest.mark.parametrize("shape", ["box", *OTHERS])
 def test_a_turning_body_never_passes_a_wall(shape, half):
     """B12a: 1000 runs of every shape at 1 to 200 m/s, turning at up to 40 rad/s."""
@@ -104,6 +105,7 @@ def test_a_turning_body_never_passes_a_wall(shape, half):
     assert not escapes(model, states).any()
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_sphere_comes_to_rest_at_the_surface(precision, gate):
     """B12a: with e = 0 at 180 m/s, straight at the wall, the surfaces meet and stay."""
     for continuous, limit in ((False, 1e-5), (True, 2e-4)):
@@ -243,6 +245,7 @@ def test_gradient_of_the_stop(float64, gate):
     gate("by the place", np.asarray(by_x) - [0.0, -30.0 / 120.0, 0.0], 1e-9)
 
 
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_slow_bodies_do_not_notice(precision, gate):
     """Neutral equals absent, but for the round-off of two programs (M2): nothing moves half its inner radius in a step."""
     finals = []
@@ -343,13 +346,15 @@ def jointed_pairs(settings):
 PAIRS = {"default": (), "continuous": (("continuous", True),), "soft_step": (("solver", "soft_step"),)}
 
 
-@pytest.mark.parametrize("settings", slow_but(("default",), PAIRS))
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", PAIRS)
 def test_a_jointed_pair_that_hits_a_wall_gains_no_energy(float64, gate, settings):
     energy, _ = jointed_pairs(PAIRS[settings])
     gate("energy / that at first - 1", np.maximum(energy - 1, 0.0), 0.001)
 
 
-@pytest.mark.parametrize("settings", slow_but(("default",), PAIRS))
+@pytest.mark.slow
+@pytest.mark.parametrize("settings", PAIRS)
 def test_a_jointed_pair_that_hits_a_wall_closes_again(float64, gate, settings):
     _, opening = jointed_pairs(PAIRS[settings])
     gate("opening 0.7 s after the impact [m]", opening[-18:], 0.005)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, Sphere
+from tests.marks import QUICK_IN_FLOAT64
 from tests.scenes import (
     DOWN,
     GRAVITY,
@@ -55,6 +56,7 @@ def height(time):
 
 
 @pytest.mark.parametrize("box", [None, *(pytest.param(box, marks=pytest.mark.slow) for box in ("beside", "below"))])
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_bounces_at_any_time_step(precision, box, gate):
     """Up to three bounces within a step; the box stays at rest and the other ball in free fall."""
     model, state = bouncing(box)

@@ -207,6 +207,7 @@ def test_damping_of_a_ball_decays_its_spin(precision, gate):
     gate("spin / truth - 1", found["spin"][:, 1] / truth - 1, 1e-4)
 
 
+@pytest.mark.slow
 def test_boxes_joined_fly_as_one_body(float64, gate):
     """A tumbling pair against one compound body of the same density, which is integrated on its own."""
     offset, mass = two_boxes()

@@ -227,7 +227,9 @@ def two_free_bodies(joint, motor):
     return builder.build(undamped(dt=DT))
 
 
-@pytest.mark.parametrize(("joint", "motor"), [(Hinge, "torque"), (Slider, "torque")])
+@pytest.mark.parametrize(
+    ("joint", "motor"), [(Hinge, "torque"), pytest.param(Slider, "torque", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     model, state = two_free_bodies(joint, motor)

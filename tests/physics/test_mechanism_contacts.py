@@ -21,7 +21,7 @@ from mathota_jax import (
     step,
 )
 from mathota_jax.constraints import mechanism_layout
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
 from tests.scenes import DOWN, GRAVITY, undamped
 
 UP = (0.0, 1.0, 0.0)
@@ -65,7 +65,7 @@ def stand(model, state):
 @pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
 @pytest.mark.parametrize(
     "masses",
-    [LIGHT, (0.002, *LIGHT[1:]), (20.0, 2.0, 1.0, 0.5), (0.2, 50.0)],
+    [LIGHT, (0.002, *LIGHT[1:]), (20.0, 2.0, 1.0, 0.5), pytest.param((0.2, 50.0), marks=pytest.mark.slow)],
     ids=["light", "tiny", "heavy", "of one joint"],
 )
 def test_a_leg_stands_on_its_foot(precision, masses, dt, gate):
@@ -117,13 +117,13 @@ def carry_a_ball(builder, options, gate):
     return model, final
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_a_leg_carries_a_free_ball(precision, gate):
     """Rows of bodies that are no links are part of the same system."""
     carry_a_ball(on_ground(), undamped(dt=1 / 60), gate)
 
 
-@pytest.mark.parametrize("ball", [True, False])
+@pytest.mark.parametrize("ball", slow_but((True,), (True, False)))
 def test_a_shelf_on_a_wall(ball, gate):
     """Welded to what never moves, so that the mechanism has no way to move: a ball lies on it, or nothing does."""
     builder = on_ground()
@@ -184,7 +184,7 @@ def test_derivatives_of_a_sled(float64, gate, mode):
     gate("derivatives / truth - 1", derivatives_of_way(*slide(), mode) - 1, 1e-4)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_a_table_on_driven_legs(precision, gate):
     """Legs that motors hold still bear the weight; they may share it as they like. The usual sweeps move it by 0.3 mm."""
     builder = on_ground()

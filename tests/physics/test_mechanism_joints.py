@@ -155,7 +155,8 @@ def test_stop_without_restitution(precision, gate):
     gate("angle at the end - stop [rad]", angle[-1] - 0.5, 1e-4)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivatives_by_what_acts_on_the_arms(float64, mode, gate):
     """All stiffnesses, dampings, frictions and caps times a factor: of angles and rates after 0.6 s, by the factor.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Hinge, SceneBuilder, Sphere
-from tests.marks import QUICK_IN_FLOAT64
+from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64
 from tests.scenes import advance, body_on_plane, motion, record_worlds, repeat, sphere_on_plane, undamped
 
 
@@ -38,6 +38,7 @@ def test_zero_restitution_equals_no_restitution(precision, gate):
     gate("trajectory", difference, {"float32": 60e-6, "float64": 60e-12}[str(precision)])
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_zero_gravity_and_distant_company_change_nothing(precision, gate):
     """A body far away and a joint elsewhere leave a sliding sphere alone."""
 

@@ -14,7 +14,7 @@ import pytest
 
 from mathota_jax import Box, Distance, Fixed, Hinge, Plane, SceneBuilder, Sphere, contact_forces, energy, step
 from mathota_jax.constraints import mechanism_layout
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
 from tests.scenes import advance_worlds, repeat, rotation_matrix, undamped
 
 BALL, DT, MASS = 2, 1 / 240, 2.0
@@ -45,8 +45,8 @@ def wedge(solver="pgs", walls=WALLS, carried=(), roped=False, **options):
     [
         ("pgs", (), {}),
         ("converged", (), {}),
-        ("pgs", (1.98,), {}),
-        ("pgs", (0.4, 0.3, 0.3), {"broadphase": "all_pairs"}),
+        pytest.param("pgs", (1.98,), {}, marks=pytest.mark.slow),
+        pytest.param("pgs", (0.4, 0.3, 0.3), {"broadphase": "all_pairs"}, marks=pytest.mark.slow),
         ("pgs", (0.4, 0.3, 0.3), {"roped": True}),
     ],
     ids=["pgs", "converged", "welded", "welded, beside a broadphase", "welded and swept"],
@@ -103,7 +103,7 @@ def test_derivatives(float64, gate, differentiate, carried):
 
 
 @pytest.mark.parametrize("restitution", [0.5, 1.0])
-@pytest.mark.parametrize("friction", [0.0, 0.5, 0.7])
+@pytest.mark.parametrize("friction", slow_but((0.5, 0.7), (0.0, 0.5, 0.7)))
 def test_a_double_pendulum_strikes_the_ground(float64, gate, restitution, friction):
     """T. R. Kane, "A dynamics puzzle", Stanford Mechanics Alumni Club Newsletter, 1984: its energy must not grow.
 

@@ -226,6 +226,7 @@ def test_a_slow_pendulum_does_not_sleep_at_its_turning_point(gate):
     assert not np.asarray(record.sleep.asleep).any()
 
 
+@pytest.mark.slow
 def test_sleep_does_nothing_to_what_never_rests():
     """Neutral equals absent (benchmark M2): with thresholds that nothing meets, the trajectory is that without sleep."""
     never = sleepy(sleep_velocity=1e-30, sleep_angular_velocity=1e-30)

@@ -23,7 +23,7 @@ from mathota_jax import (
     rollout,
     step,
 )
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
 from tests.scenes import DOWN, GRAVITY, add_driven_hinge, quadruped, stiffened, undamped
 
 LINKS, LENGTH = 6, 0.2
@@ -55,7 +55,7 @@ def angles_at_rest(stiffness):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
+@pytest.mark.parametrize("dt", slow_but((1 / 60,), (1 / 60, 1 / 240)))
 @pytest.mark.parametrize("drive", ["servo", pytest.param("spring", marks=pytest.mark.slow)])
 def test_an_arm_bears_its_weight(precision, drive, dt, gate):
     """With ten sweeps the links moved by 46 m/s at 1/60 s and 1e4 N m/rad."""
@@ -103,7 +103,7 @@ def test_what_a_servo_at_its_cap_does_not_carry_the_others_do_not_either(float64
     gate("elbows [rad]", joint_position(model, final)[1:], 5e-5)
 
 
-@pytest.mark.parametrize("dt", [1 / 60, 1 / 240])
+@pytest.mark.parametrize("dt", slow_but((1 / 60,), (1 / 60, 1 / 240)))
 def test_an_arm_of_springs_gains_no_energy(float64, dt, gate):
     """It starts level, turning as a whole by 2 rad/s; no damping."""
     model, state = arm("spring", dt)
@@ -188,8 +188,9 @@ def slope_of_a_crouch(mode):
     return jax.jit(mode(height))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffness", "limit"), [(2e3, 0.025), (1e4, 0.01)])
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 def test_derivative_of_a_crouch(float64, mode, stiffness, limit, gate):
     """Of the height by the angle of the hips, from the kinematics of the legs. By sweeps alone it had the wrong sign."""
     below = np.arcsin(THIGH * np.sin(CROUCH) / SHIN)
@@ -215,8 +216,8 @@ def test_a_robot_on_stiff_legs_stands_still(precision, drive, gate):
         gate(f"borne at {stiffness:g} N m/rad / weight - 1", borne / (22.4 * GRAVITY) - 1, 1e-4)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("on_ground", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("on_ground", [True, False])
 def test_random_arms_gain_no_more_than_their_servos_give(precision, on_ground, gate):
     """Masses 1 : 1000, stiffnesses 1 to 1e6 and caps 0.1 to 1000 N m at random; stops and friction; targets that change."""
     worlds, steps = 64, 180

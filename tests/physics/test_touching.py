@@ -34,8 +34,8 @@ def takes_contacts(model):
     return model.scene.broadphase is not None and mechanism_layout.takes_contacts(model.scene)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("ground", ["plane", pytest.param("slab", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ground", ["plane", "slab"])
 def test_a_leg_carries_a_free_ball(precision, ground, gate):
     """Foot on the ground, ball on a plate: pairs of one moving body and of two, of one point and of four."""
     builder = {"plane": on_ground, "slab": on_slab}[ground]()
@@ -142,7 +142,7 @@ def test_a_robot_that_may_touch_itself_stands(precision, tiles, gate):
     stand_still(stiffened(model, "servo", 2000.0, 40.0), state, 22.4, 3e-4, gate)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_a_humanoid_stands(precision, gate):
     """Rows for all of its 33 points on the plane leave too little room: swept in turn with its joints it sat down."""
     model, state = humanoid(undamped(dt=1 / 60))
@@ -161,7 +161,7 @@ def studded(options, friction=0.5, speed=0.0):
     return *builder.build(options), bodies
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_a_leg_stands_on_a_foot_of_many_points(precision, gate):
     """More rows than a matrix holds, without a broadphase. Where it has room for three points, a flag tells."""
     model, state, _ = studded(undamped(dt=1 / 60, broadphase="none", velocity_iterations=40))

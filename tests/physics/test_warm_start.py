@@ -43,7 +43,7 @@ def boxes():
     return builder.build(Options(dt=1 / 60, velocity_iterations=300))
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_removing_the_heavy_ball_does_not_lift_the_light_ones(precision, gate):
     model, state = pile()
     loaded = advance(model, state, 120)

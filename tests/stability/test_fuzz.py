@@ -30,6 +30,7 @@ from mathota_jax import (
     energy,
     momentum,
 )
+from tests.marks import slow_but
 from tests.scenes import record_worlds, repeat, undamped
 
 SIZES, MASSES, SPEED, SPIN = (1e-3, 1e3), (1.0, 1e4), 100.0, 100.0
@@ -172,7 +173,7 @@ def check_falling(gate: Any, shapes: Any, dt: float, count: int, steps: int, see
 CHECKS = {"free": check_free, "falling": check_falling}
 
 
-@pytest.mark.parametrize("check", CHECKS)
+@pytest.mark.parametrize("check", slow_but(("falling",), CHECKS))
 def test_random_worlds(gate, check):
     CHECKS[check](gate, CLOSED_FORMS, 1 / 60, 256, 60, 1, np.dtype("float32"))
 

@@ -84,6 +84,7 @@ def diagonal(blocks):
     return np.stack([blocks[world, :, world] for world in range(WORLDS)])
 
 
+@pytest.mark.slow
 def test_derivatives_against_finite_differences(float64):
     """The one truth for all derivatives: differences of unbatched calls, away from any kink."""
     batch = parameters()
@@ -172,8 +173,14 @@ def assert_states_equal(measured, truth):
         np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12, err_msg=jax.tree_util.keystr(path))
 
 
-@pytest.mark.parametrize("jit", [False, True], ids=["eager", "jit"])
-@pytest.mark.parametrize("mapped", ["all", "model shared", "action shared", "state shared", "no action"])
+@pytest.mark.parametrize(
+    ("mapped", "jit"),
+    [
+        pytest.param(mapped, jit, id=f"{mapped}-{name}", marks=() if jit or mapped == "all" else pytest.mark.slow)
+        for name, jit in (("eager", False), ("jit", True))
+        for mapped in ("all", "model shared", "action shared", "state shared", "no action")
+    ],
+)
 def test_shared_arguments(float64, mapped, jit):
     """Any of model, state and action may be shared by the worlds."""
     models, states, actions = worlds()

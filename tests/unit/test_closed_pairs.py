@@ -21,6 +21,7 @@ from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
 from tests.hulls import BOX_CORNERS, hull, point_to_hull
+from tests.marks import QUICK_AND_SLOW_PRECISION
 
 FUNCTIONS = {
     ("plane", "cylinder"): plane_cylinder,
@@ -311,6 +312,7 @@ DEGENERATE_TURNS = [Rotation.identity()] + [
 
 
 @pytest.mark.parametrize("pair", PAIRS, ids=IDS)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_degenerate_poses_stay_finite_and_right(pair, precision):
     """Centre on the axis, on the rim, at the apex, on a face, an edge or a corner; axes upright and lying."""
     table = [(o, t) for o in DEGENERATE_OFFSETS for t in DEGENERATE_TURNS]

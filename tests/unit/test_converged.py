@@ -14,6 +14,7 @@ from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Constraint, make_tables
+from tests.marks import slow_but
 from tests.scenes import box_stack, slab_on_plane, stack, undamped
 
 BODIES, CONTACTS = 4, 14
@@ -174,6 +175,7 @@ def slab():
     return slab_on_plane(friction=0.4, options=undamped(dt=1 / 60, solver="converged"))
 
 
+@pytest.mark.slow
 @STICKING_AND_SLIDING
 def test_derivatives_against_finite_differences(float64, push, gate):
     """Reverse mode of the velocity, whose impulses are not unique."""
@@ -200,7 +202,7 @@ def test_both_modes_agree(float64, push, gate):
         gate(f"by {by}, forward - reverse", first - second, 1e-9)
 
 
-@pytest.mark.parametrize("friction", [None, 0.5])
+@pytest.mark.parametrize("friction", slow_but((0.5,), (None, 0.5)))
 def test_derivative_agrees_with_that_of_the_sweeps(float64, friction, gate):
     """Where the sweeps converge as well, both differentiate the same fixed point."""
     jacobian, inverse_mass, free = random_problem(3, friction=friction is not None)

@@ -32,6 +32,7 @@ from tests.convex_oracle import (
 )
 from tests.direction_oracle import direction_distance
 from tests.hulls import BOX_CORNERS
+from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64
 from tests.polytope_oracle import polytope_distance, polytope_pairs
 
 SEARCHED_PAIRS = [pair for pair in PAIRS if PAIRS[pair].method in SEARCHED]
@@ -79,6 +80,7 @@ def check(pair, scene, dtype):
 
 
 @pytest.mark.parametrize("pair", every_pair(*QUICK))
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_random_poses(pair, precision):
     result = check(pair, random_scene(pair, NORMAL_COUNT), precision)
     assert 0.1 < (result.separation < 0).mean() < 0.99  # both regimes are there
@@ -103,6 +105,7 @@ def test_what_is_not_flagged_is_right(pair, kind, precision):
         for pair in pose_classes.EVERY
     ],
 )
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_separated_touching_shallow_and_deep_poses(pair, precision):
     """Nothing wrong without a flag and no wrong sign; see `tests.benchmarks.pose_classes` for 20,000 of each pair."""
     name = np.dtype(precision).name
@@ -141,6 +144,7 @@ def test_a_side_that_ends_before_it_crosses_the_other():
     check(("cylinder", "cylinder"), scene, np.dtype("float32"))
 
 
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_a_corner_that_all_but_meets_a_corner(precision):
     """A hull with a corner pressed into a face of a box by next to nothing, at 1e-6 to 1e-2 from the corner of the face."""
     pair, count = ("box", "polyhedron"), 400
@@ -160,6 +164,7 @@ def test_a_corner_that_all_but_meets_a_corner(precision):
 
 
 @pytest.mark.parametrize("other", ["capsule", "box"])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_sphere_whose_centre_all_but_touches_the_core(other, precision):
     """From 1e-9 to 1e-3 off an axis, a corner, an edge or a face, in any direction: in closed form, and proved."""
     rng, count = np.random.default_rng(11), 400
@@ -245,6 +250,7 @@ def test_support_points_are_extreme(kind):
     assert set(SUPPORT) == set(KINDS)
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_polyhedron_of_more_corners_than_are_unrolled(precision):
     """A hull above a plate: its lowest corner counts."""
     points = np.random.default_rng(4).normal(size=(UNROLLED_VERTICES + 12, 3))

@@ -18,6 +18,7 @@ from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
 from tests.hulls import BOX_CORNERS, hull, point_to_hull
+from tests.marks import QUICK_IN_FLOAT64
 
 COUNT = 64
 HEXAGON = np.array([[np.cos(a), y, np.sin(a)] for a in np.arange(6) * np.pi / 3 + 0.2 for y in (-1, 1)]) * 0.5
@@ -204,6 +205,7 @@ POSES = {
 
 @pytest.mark.parametrize("plate", PLATES)
 @pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_shapes_on_a_plate(name, plate, precision):
     """Number of points, exact depth, the centre of support inside, at tilts from nothing to 1e-3."""
     shape, pose, expected, extent = POSES[name]
@@ -518,6 +520,7 @@ def cylinders_side_by_side(angle, shift, gap=-1e-3):
     }
 
 
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_parallel_cylinders_touch_along_the_overlap(precision):
     shift = np.linspace(-0.7, 0.7, COUNT)
     result = Result(cylinders_side_by_side(1e-7, shift), precision)

@@ -24,6 +24,7 @@ from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3
 from tests.hulls import hull
+from tests.marks import slow_but
 
 FUNCTIONS = {
     "sphere": plane_sphere,
@@ -470,7 +471,7 @@ def simulate(shape, ground, seconds, dt=0.005, **body):
     return jax.tree.map(np.asarray, jax.jit(lambda s: jax.lax.scan(turn, s, None, length=round(seconds / dt)))(state))
 
 
-@pytest.mark.parametrize("slope", [0.0, 0.3], ids=["flat", "inclined"])
+@pytest.mark.parametrize("slope", slow_but((0.3,), (0.0, 0.3)), ids=["flat", "inclined"])
 def test_box_rests_and_slides_as_on_a_plane(slope, float64, gate):
     along = (np.arange(13) - 6.0) * CELL
     ground = Heightfield(np.tile(slope * along[:, None], (1, 13)), CELL)

@@ -91,7 +91,7 @@ def test_what_never_meets_may_be_ignored_at_no_change(float64, gate):
         gate(leaf, np.asarray(getattr(finals[0], leaf) - getattr(finals[1], leaf)), 1e-12)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_a_robot_that_ignores_itself_stands_on_light_feet(precision, gate):
     """Four legs of two capsules: with their own pairs left out, contacts are solved with the joints held."""
     options = undamped(dt=1 / 240)

@@ -15,6 +15,7 @@ from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
+from tests.marks import QUICK_AND_SLOW_PRECISION
 
 # The pairs of the first four kinds; others in test_closed_pairs, test_convex, test_face_manifold and test_queries.
 POSE_COUNT = 256
@@ -391,6 +392,7 @@ def fixed_scene(pair, offsets, rotations_a, rotations_b, size=0.5):
 
 
 @pytest.mark.parametrize("pair", PAIR_NAMES, ids=IDS)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_degenerate_poses_stay_finite_and_right(pair, precision):
     """Coincident centres, parallel and crossing axes, exact touch of faces, edges and corners, tilts to nothing."""
     turns = [Rotation.identity()]

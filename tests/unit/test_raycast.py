@@ -153,6 +153,7 @@ def test_every_shape_can_be_seen():
 
 
 @pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_rays_meet_shapes_where_their_inside_begins(name, precision):
     shape = VARIANTS[name]
     origin, direction = rays(shape)

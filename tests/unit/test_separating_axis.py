@@ -17,6 +17,7 @@ from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
 from tests.convex_oracle import Placed, oracle, random_scene, rounded, to_engine, with_faces
+from tests.marks import QUICK_IN_FLOAT64
 
 
 @functools.partial(jax.jit, static_argnames="pair")
@@ -29,6 +30,7 @@ def axis(pair, wanted, a, pa, qa, b, pb, qb):
 
 
 @pytest.mark.parametrize("pair", [("polyhedron", "polyhedron"), ("capsule", "box"), ("sphere", "polyhedron")])
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_depth_of_overlapping_cores_against_the_oracle(pair, precision):
     """In more pairs than are tested at a time, of which only some are wanted."""
     count = LANES + 400

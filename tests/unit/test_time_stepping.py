@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from mathota_jax import Flag, Options, advance, apply_force, interpolate, step, substep
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64
 from tests.scenes import GRAVITY, box_stack, slab_on_plane, sphere_on_plane, undamped, with_dt
 
 DT = 1 / 64  # a power of two: sums of steps are exact
@@ -20,6 +20,7 @@ def falling(**changes):
 
 
 @pytest.mark.parametrize("frame", [0.3 * DT, DT, 1.7 * DT, 2.999 * DT])
+@pytest.mark.parametrize("precision", QUICK_IN_FLOAT64, indirect=True)
 def test_frames_add_up_to_the_time_that_passed(precision, frame, gate):
     model, state = falling()
     accumulator, total, calls = 0.0, 0, 40
@@ -46,6 +47,7 @@ def test_a_frame_of_one_step_is_one_step_however_it_rounds():
         assert int(found.step_count) == 1
 
 
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_frame_equals_its_steps(precision):
     model, state = slab_on_plane(velocity=(1.0, 0.0, 0.5), options=undamped(dt=DT))
     expected = state

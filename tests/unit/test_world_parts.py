@@ -9,6 +9,7 @@ import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, step
 from mathota_jax.spatial.world_parts import FEWEST, LANES, MOST, by_parts, part_size
+from tests.marks import slow_but
 from tests.scenes import repeat, undamped
 
 WORLDS, SMALL, STEPS = 600, 200, 4
@@ -65,7 +66,7 @@ def program(function, batch, platform):
     return jax.jit(jax.vmap(function)).trace(batch).lower(lowering_platforms=(platform,)).as_text()
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", slow_but(("values", "shared model"), FUNCTIONS))
 def test_worlds_are_those_of_small_batches(float64, name):
     batch = speeds()
     mapped = jax.jit(jax.vmap(FUNCTIONS[name]))
