@@ -160,8 +160,9 @@ class SceneBuilder:
 
         The command is the action, clipped to `limit`, times `gear`. "torque": it is the torque [N m] of a hinge or the
         force [N] of a slider or distance joint. "velocity": it is the rate that the motor keeps with a torque of at most
-        `cap`. "position": it is the coordinate c to which the motor pulls like a spring and damper, with the torque
-        ``stiffness (c - coordinate) - damping rate`` clipped to `cap`; implicit, so that any stiffness is stable.
+        `cap`, as far as the stops of the joint leave room. "position": it is the coordinate c to which the motor pulls like
+        a spring and damper, with the torque ``stiffness (c - coordinate) - damping rate`` clipped to `cap`; implicit, so
+        that any stiffness is stable.
 
         Args:
           joint: handle or name of the joint, which must have a single free coordinate.

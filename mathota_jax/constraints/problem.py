@@ -121,7 +121,7 @@ def constrain(
         middle = joint_rows.joint_rows(model, there)
         if mechanism_layout.layout(scene) is not None:
             held = mechanism_links.links(scene, middle, moving(scene, there).position, inertia)
-        coefficients = row_coefficients.row_coefficients(model, action)
+        coefficients = row_coefficients.row_coefficients(model, action, joints)
         turning = joint_rows.turning(model, bodies, joints, middle)
         joint_motion = joint.JointMotion(joints, middle, coefficients, inertia, turning)
         order = joint_layout.joint_tables(scene)
