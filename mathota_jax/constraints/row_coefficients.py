@@ -7,6 +7,7 @@ from jax import Array
 
 from mathota_jax.constraints.joint_layout import JointGroup, joint_groups
 from mathota_jax.constraints.joint_rows import JointRows, stack_rows
+from mathota_jax.constraints.row_laws import rate_to_stop
 from mathota_jax.model import Model
 from mathota_jax.spatial.indexing import take
 
@@ -83,8 +84,8 @@ def _within_stops(rate: Array, group: JointGroup, joints: JointRows, dt: Array) 
             continue
         slots = group.slots(group.kind.row_count(group.features[: group.features.index(feature)]))
         room, opening = joints.error[slots], joints.rate[slots]
-        # The stop holds on average over the step (`row_laws`); small steps hold at every moment.
-        most = jnp.minimum(room / dt, jnp.maximum(2.0 * room / dt + opening, 0.0))
+        # The stop holds on average over the step; small steps hold at every moment.
+        most = jnp.minimum(room / dt, rate_to_stop(room, opening, dt))
         back = jnp.maximum(RETURN * room / dt, -jnp.abs(rate))
         rate = outwards * jnp.minimum(outwards * rate, jnp.where(room > 0, most, back))
     return rate

@@ -64,15 +64,22 @@ def _hold(columns: Columns) -> Response:
     return Response(columns.baumgarte * columns.error / columns.dt)
 
 
+def rate_to_stop(room: Array, opening: Array, dt: Array) -> Array:
+    """Largest rate at the end of the step towards a stop, from the room left before it and the rate at which that grows.
+
+    The room left changes by ``dt (start + end) / 2``: the rate at the end may just close it, and is 0 where the present
+    rate would close it in less than half the step.
+    """
+    return jnp.maximum(2.0 * jnp.maximum(room, 0.0) / dt + opening, 0.0)
+
+
 def _stop(columns: Columns) -> Response:
     """No further than the stop, without restitution.
 
-    The room left changes by ``dt (start + end) / 2``: the rate at the end may just close it, and is 0 where the present
-    rate would close it in less than half the step. What then is too far the position correction takes back, without
-    energy. (Impulses of a shorter lever, as contacts have, would part the joints that pass them on.)
+    What is too far after the step the position correction takes back, without energy. (Impulses of a shorter lever, as
+    contacts have, would part the joints that pass them on.)
     """
-    room = jnp.maximum(columns.error, 0.0)
-    return Response(jnp.maximum(2.0 * room / columns.dt + columns.rate, 0.0), lower=0.0)
+    return Response(rate_to_stop(columns.error, columns.rate, columns.dt), lower=0.0)
 
 
 def _viscous(columns: Columns) -> Response:

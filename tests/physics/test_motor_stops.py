@@ -13,20 +13,18 @@ LENGTH, HALF, MASS, STOP, DT = 0.4, 0.02, 1.0, 0.3, 1 / 240
 
 
 def arms(solver, cap):
-    """An arm of two links that is driven up, and one of a single link driven down: joints, ways to the stops.
+    """An arm of two links that is driven up, and one of a single link driven down; also the ways of the joints.
 
     Weights pull the one off its stops and press the other into its.
     """
     builder = SceneBuilder(gravity=DOWN)
     post = builder.add_body(Sphere(0.02), static=True, collides=False)
-    for count, away in ((2, 1.0), (1, -1.0)):
+    for count, limits in ((2, (-1.0, STOP)), (1, (-STOP, 1.0))):
         last = post
         for link in range(count):
-            centre = (away * LENGTH * (link + 0.5), 0, 0)
+            centre = (LENGTH * (link + 0.5), 0, 0)
             body = builder.add_body(Box((LENGTH / 2, HALF, HALF)), mass=MASS, position=centre, collides=False)
-            anchor = (away * LENGTH * link, 0, 0)
-            limits = (-1.0, STOP) if count == 2 else (-STOP, 1.0)
-            joint = builder.add_joint(Hinge(last, body, anchor, (0, 0, 1), limits=limits))
+            joint = builder.add_joint(Hinge(last, body, (LENGTH * link, 0, 0), (0, 0, 1), limits=limits))
             builder.add_motor(joint, kind="velocity", cap=cap)
             last = body
     model, state = builder.build(undamped(dt=DT, solver=solver))
@@ -39,14 +37,11 @@ def test_a_motor_holds_its_joint_at_the_stop_and_leaves_it_as_told(solver, cap, 
     model, state, ways = arms(solver, cap)
     actions = np.repeat([ways, -ways], [720, 60], axis=0)
     _, record = rollout(model, state, jnp.asarray(actions))
-    place, rate, force = (
-        np.asarray(jax.vmap(found)(record))
-        for found in (
-            lambda state: joint_position(model, state),
-            lambda state: joint_velocity(model, state),
-            lambda state: joint_forces(model, state)[0],
-        )
-    )
+
+    def observe(state):
+        return joint_position(model, state), joint_velocity(model, state), joint_forces(model, state)[0]
+
+    place, rate, force = (np.asarray(found) for found in jax.vmap(observe)(record))
     told = np.minimum(np.arange(1, 721) * DT, STOP)[:, None] * ways
     gate("on the way [rad]", place[:720] - told, 1.5 * DT)
     gate("at the stop [rad]", place[240:720] - STOP * ways, 2e-5)
