@@ -76,6 +76,7 @@ def test_program_grows_with_the_scene():
     assert values[0] < values[1] < values[2] <= values[3] < values[4] < values[5] < values[6], sizes
 
 
+@pytest.mark.slow
 def test_gradient_program_grows_with_the_scene():
     """What is absent from the step is absent from its derivative."""
 

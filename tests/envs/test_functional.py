@@ -49,7 +49,8 @@ def test_starts_follow_from_the_key_and_differ_between_keys(id):
     assert not (restarted == observations).all(axis=1).any(), "the second episode must start elsewhere"
 
 
-@pytest.mark.parametrize("id", slow_but(("mathota/BallBalance-v0",), ENVIRONMENTS))
+@pytest.mark.slow
+@pytest.mark.parametrize("id", ENVIRONMENTS)
 def test_a_batch_agrees_with_single_worlds(id):
     environment = make(id)
     batch = start_worlds(environment, keys(3))

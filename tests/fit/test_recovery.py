@@ -93,6 +93,7 @@ def test_multiple_shooting(gate):
     gate("noise factor - 1", result.noise_factor - 1, 0.15)
 
 
+@pytest.mark.slow
 def test_friction_of_a_puck_of_which_positions_are_known(gate):
     """Coulomb's law in closed form. Pucks that may spin on their edges explain the same with more friction.
 

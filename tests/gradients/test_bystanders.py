@@ -44,7 +44,7 @@ def bounce(height, velocity, restitution, gravity, time, count=240):
     return value_and_slopes(parameters, model, state, count)
 
 
-@PRECISIONS
+@pytest.mark.slow
 def test_one_bounce(precision, gate):
     value, slopes = bounce(1.0, -2.0, 1.0, 0.0, 1.0)
     gate("C1a: height / truth - 1", value / 1.2 - 1, 1e-3)
@@ -91,7 +91,7 @@ def test_stick_and_slip(precision, gate):
     gate("C11: v - 2.076 m/s", velocity[-1] - 2.076, 1e-2)
 
 
-@PRECISIONS
+@pytest.mark.slow
 def test_head_on_collision(precision, gate):
     builder = SceneBuilder(gravity=(0, 0, 0))
     surface = {"restitution": 0.7, "friction": 0.0}

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from mathota_jax import rollout
 from tests.physics.test_chain import chain
@@ -51,6 +52,7 @@ def exact_end(parameters):
     return jax.lax.scan(runge_kutta, start, None, length=200)[0][0]
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_angles(float64, gate):
     model, state = chain(LINKS, dt=DURATION / STEPS)
 

@@ -59,7 +59,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but({"slab", "stack", "converged"}, SCENES))
+@pytest.mark.parametrize("name", slow_but({"slab"}, SCENES))
 def test_derivatives_are_those_of_a_step_that_solves_again(float64, name):
     """Both after a few steps, when the solver starts from impulses that are nearly right."""
     model, state = SCENES[name]()

@@ -68,6 +68,7 @@ def test_same_values_and_gradients_as_rollout(precision, segment):
     assert_close(gradient, truth, tolerance)
 
 
+@pytest.mark.slow
 def test_memory_grows_with_the_root_of_the_steps():
     model, state = bouncing_ball()
 

@@ -13,6 +13,7 @@ from tests.scenes import body_on_plane, box_stack, slab_on_plane, undamped
 from tests.unit.test_converged import BODIES, random_problem, rows_of
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("friction", [None, 0.5])
 def test_unrolled_sweeps_have_the_implicit_derivative(float64, friction, gate):
     """Differentiated sweep by sweep, and as the fixed point: as close as the sweeps have converged."""

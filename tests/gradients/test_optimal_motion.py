@@ -55,7 +55,7 @@ def best_throw(velocity, model, state, count, iterations):
     return jax.lax.scan(descend, velocity, None, length=iterations)
 
 
-@PRECISIONS
+@pytest.mark.slow
 def test_slope_of_a_throw(precision, gate):
     model, state = ground_and_wall()
     loss, slope = throw(jnp.array([5.0, -5.0]), model, state, 288)
@@ -125,7 +125,7 @@ def start():
     return {**{name: jnp.asarray(value) for name, value in pairs.items()}, "force": jnp.full((STEPS, 2), 3.0)}
 
 
-@PRECISIONS
+@pytest.mark.slow
 def test_slopes_of_a_driven_collision(precision, gate):
     model, state = two_balls()
     value, slopes = end_slopes(start(), model, state)

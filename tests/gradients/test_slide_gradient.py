@@ -65,7 +65,7 @@ def test_while_sliding(precision, gate):
     gate("d v / d mass", velocity_slopes["mass"], {"float32": 1e-5, "float64": 1e-6}[str(precision)])
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_after_stopping(precision, gate):
     (position, speed), (position_slopes, velocity_slopes) = slide(0.75)
     distance = SPEED**2 / (2 * FRICTION * GRAVITY)
@@ -94,6 +94,7 @@ def test_forward_mode_equals_reverse_mode(float64):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_spinning_box_that_just_touches(float64, gate):
     """`converged`: how fast a sliding box still spins, by its mass at a given inertia, against central differences."""
     builder = SceneBuilder(gravity=DOWN)

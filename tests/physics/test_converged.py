@@ -60,7 +60,7 @@ def test_heavy_cube_on_a_light_one(precision, dt, gate):
     assert not np.asarray(final.flags).any()
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_a_stack_of_ten_boxes_does_not_move(precision, gate):
     """Benchmark B3 at 60 Hz: a stack is an equilibrium; ten sweeps sink into the slop instead."""
     model, state = box_stack(10, half=0.5, options=Options(dt=1 / 60, solver="converged"), friction=0.6)

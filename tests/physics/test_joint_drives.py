@@ -128,6 +128,7 @@ def test_undamped_spring_is_exact(precision, name, stiffness, inertia, rest, wor
     gate("place - truth, relative to the amplitude", (found["place"] - truth) / rest, limit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "stiffness", "damping"), [("damped", 50.0, 3.0), ("overdamped", 200.0, 400.0), ("critical", 200.0, 40.0)]
 )

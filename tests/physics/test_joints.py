@@ -227,10 +227,8 @@ def two_free_bodies(joint, motor):
     return builder.build(undamped(dt=DT))
 
 
-@pytest.mark.parametrize(
-    ("joint", "motor"), [(Hinge, "torque"), pytest.param(Slider, "torque", marks=pytest.mark.slow)]
-)
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint", "motor"), [(Hinge, "torque"), (Slider, "torque")])
 def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     model, state = two_free_bodies(joint, motor)
     final = advance(model, state, 120, np.array([0.5]))
@@ -242,7 +240,7 @@ def test_joint_and_motor_act_with_equal_reaction(precision, joint, motor, gate):
     assert abs(float(joint_velocity(model, final)[0])) > 0.1, "the motor does not move the joint"
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_double_pendulum_keeps_its_joints_closed(precision, gate):
     """Two links released level; the lower one is ten times as heavy."""
     builder = SceneBuilder(gravity=DOWN)

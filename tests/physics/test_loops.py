@@ -117,6 +117,7 @@ def test_four_bar_linkage(precision, solver, gate):
     gate("energy lost / that of the fall", max(0.0, first - energy.min()) / (GRAVITY * 3 * CRANK), 1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS[:2])
 def test_a_driven_linkage_turns_as_told_and_stops_at_its_stop(solver, gate):
     """A motor drives the crank against gravity and dry friction, 0.3 rad to a stop."""

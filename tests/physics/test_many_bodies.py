@@ -250,6 +250,7 @@ def bin_of(count, **options):
     return builder.build(Options(**{"dt": 1 / 240, **options}))
 
 
+@pytest.mark.slow
 def test_bin_of_spheres_comes_to_rest(gate):
     """64 spheres against static boxes (one moving body a pair) and each other, float32, default iterations."""
     model, state = bin_of(64)

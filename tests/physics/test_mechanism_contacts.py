@@ -81,6 +81,7 @@ def test_a_leg_stands_on_its_foot(precision, masses, dt, gate):
     gate("borne by the ground / weight - 1", abs(borne) / (GRAVITY * sum(masses)) - 1, 1e-5)
 
 
+@pytest.mark.slow
 def test_a_frictionless_leg_stands(gate):
     builder = on_ground(0.0)
     leg(builder, (0.2, 10.0, 10.0), friction=0.0)

@@ -56,6 +56,7 @@ def check_swing(gate, model, state):
     gate("energy / that of the swing", float(energy(model, state)) / 4.905, 2e-3)
 
 
+@pytest.mark.slow
 def test_time_step_may_change(float64, gate):
     """At 1/480 s and 1/240 s by turns: the motion and energy of the chain, and no gap."""
     model, state = chain(LINKS, dt=1 / 240)
@@ -165,7 +166,8 @@ def test_a_ball_wakes_a_free_chain(precision, gate):
 # Fast bodies ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", [30.0, pytest.param(180.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [30.0, 180.0])
 def test_a_fast_chain_does_not_pass_a_wall(speed, gate):
     """Four balls in a row, jointed, fly at a wall as thick as they are, at up to 15 times that a step."""
     builder = SceneBuilder(gravity=(0, 0, 0))

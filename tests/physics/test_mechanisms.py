@@ -69,6 +69,7 @@ def test_servos_carry_the_arm(float64, gate):
     gate("spring torque / load - 1", -40.0 * angles / np.array(torque) - 1.0, 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_a_chain_falls_on_the_ground(solver, gate):
     """Six links, free, thrown up at one end: they come to rest on the ground, joined."""

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, step
-from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, GRAVITY, HALVES_BY_PROPORTION, advance, undamped
 
 FRICTION = 0.5
@@ -63,7 +63,8 @@ def test_it_stays_at_rest(precision, name, gate):
     gate("speed [m/s, rad/s]", motion(jnp.asarray(LOAD, precision), model, state), 2e-4)
 
 
-@pytest.mark.parametrize("name", slow_but(("cube",), HALVES_BY_PROPORTION))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HALVES_BY_PROPORTION)
 def test_its_derivatives_are_zero(float64, name, gate):
     """Free, they are dt / mass = 0.033 and more."""
     model, state = on_plane(HALVES_BY_PROPORTION[name])

@@ -47,7 +47,7 @@ def wedge(solver="pgs", walls=WALLS, carried=(), roped=False, **options):
         ("converged", (), {}),
         pytest.param("pgs", (1.98,), {}, marks=pytest.mark.slow),
         pytest.param("pgs", (0.4, 0.3, 0.3), {"broadphase": "all_pairs"}, marks=pytest.mark.slow),
-        ("pgs", (0.4, 0.3, 0.3), {"roped": True}),
+        pytest.param("pgs", (0.4, 0.3, 0.3), {"roped": True}, marks=pytest.mark.slow),
     ],
     ids=["pgs", "converged", "welded", "welded, beside a broadphase", "welded and swept"],
 )

@@ -349,7 +349,7 @@ def test_flight_is_exact(precision, gate):
 # Derivatives ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_derivatives_of_a_slide_to_rest(precision, gate):
     model, state = slab_on_plane(options=soft_undamped())
     values = {"speed": 2.0, "friction": 0.4, "mass": 1.0, "gravity": GRAVITY}

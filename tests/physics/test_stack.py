@@ -63,6 +63,7 @@ def test_each_level_carries_the_weight_above_it(precision, gate):
         gate(f"force under box {level + 1} / weight above", carried / ((COUNT - level) * weight) - [0, 1, 0], 0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("warm_start", [True, False])
 def test_warm_start_is_what_carries_a_tall_stack(float64, warm_start):
     """Cold sweeps need about 1.86 N^2 = 186 iterations for ten boxes (benchmark B3); ten of them must fall short."""

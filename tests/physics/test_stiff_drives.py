@@ -103,7 +103,8 @@ def test_what_a_servo_at_its_cap_does_not_carry_the_others_do_not_either(float64
     gate("elbows [rad]", joint_position(model, final)[1:], 5e-5)
 
 
-@pytest.mark.parametrize("dt", slow_but((1 / 60,), (1 / 60, 1 / 240)))
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", (1 / 60, 1 / 240))
 def test_an_arm_of_springs_gains_no_energy(float64, dt, gate):
     """It starts level, turning as a whole by 2 rad/s; no damping."""
     model, state = arm("spring", dt)
@@ -198,8 +199,8 @@ def test_derivative_of_a_crouch(float64, mode, stiffness, limit, gate):
     gate("slope / truth - 1", float(slope_of_a_crouch(mode)(CROUCH, stiffness)) / truth - 1, limit)
 
 
-@pytest.mark.parametrize("drive", ["servo", pytest.param("spring", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["servo", "spring"])
 def test_a_robot_on_stiff_legs_stands_still(precision, drive, gate):
     """Ten sweeps alone, and forty at 2000 N m/rad, made it shiver by 0.2 m/s at 1/60 s."""
     model, state = quadruped(drive, undamped(dt=1 / 60))

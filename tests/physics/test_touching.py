@@ -47,7 +47,8 @@ def test_a_leg_carries_a_free_ball(precision, ground, gate):
 LENGTH = 0.4
 
 
-@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 def test_derivatives_of_a_push(float64, gate, mode):
     """A motor of torque T on an arm of inertia I pushes a ball of mass m a distance L away: ``v = T L t / (I + m L^2)``.
 
@@ -185,6 +186,7 @@ def test_derivatives_of_a_sled_on_many_points(float64, gate, mode):
     gate("derivatives / truth - 1", derivatives_of_way(model, state, bodies, 24 / 60, 24, mode) - 1, 1e-4)
 
 
+@pytest.mark.slow
 def test_contacts_beyond_the_capacity_set_a_flag(gate):
     """Three balls on a plate without friction, of which two find a place: the deepest ones. World by world.
 

@@ -69,7 +69,7 @@ def test_a_tiny_step_in_which_a_box_lands(precision, gate, small):
     gate("spin [rad/s]", record["angular_velocity"][:, 0, 1], 1.0)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_changing_the_time_step_does_not_kick(precision, gate):
     model, state = boxes()
     settled = advance(model, state, 120)

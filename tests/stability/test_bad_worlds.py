@@ -118,7 +118,8 @@ def slopes(models, states):
     return jax.vmap(jax.grad(places, (2, 3)))(models, states, states.velocity, models.mass)
 
 
-@pytest.mark.parametrize("swings", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("swings", [False, True])
 def test_a_bad_world_leaves_the_derivatives_of_the_others_alone(swings):
     """The same to the bit, and finite."""
     models, states = batch(swings=swings)

@@ -45,7 +45,7 @@ def run(worlds, step_count):
     return record, record["position"] - np.asarray(states.position, float)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_ten_cubes_far_from_the_origin(precision, gate):
     """A stack at a distance drifts as one at the origin does: to 1 km in float32, to 1e4 km in float64."""
     distances = (0.0, 1e2, 1e3) if precision == "float32" else (0.0, 1e3, 1e5, 1e7)

@@ -152,6 +152,7 @@ def test_centre_of_mass_of_the_cube():
     np.testing.assert_allclose(halves, [[0.0, 0.0, 5e-3]] * 2, atol=1.5e-3)
 
 
+@pytest.mark.slow
 @needs_data
 def test_friction_of_first_impacts():
     """Engines of three makers, tuned to whole tosses, find 0.17 to 0.18."""

@@ -110,6 +110,7 @@ def gradient_of_each():
     return loop(jax.grad(cost), parameters())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_but(("vmap(jacfwd)",), FIRST_ORDER))
 def test_jacobians(float64, name):
     transform, arrange = FIRST_ORDER[name]

@@ -14,7 +14,6 @@ from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.table import Constraint, make_tables
-from tests.marks import slow_but
 from tests.scenes import box_stack, slab_on_plane, stack, undamped
 
 BODIES, CONTACTS = 4, 14
@@ -133,6 +132,7 @@ def test_contact_laws_hold(precision, seed, mass_ratio, gate):
     assert size > 0.1
 
 
+@pytest.mark.slow
 def test_worlds_do_not_touch_each_other(float64, gate):
     """Worlds that need different numbers of iterations give what each gives alone."""
     model, state = box_stack(2, options=Options(dt=1 / 60, solver="converged"))
@@ -202,7 +202,8 @@ def test_both_modes_agree(float64, push, gate):
         gate(f"by {by}, forward - reverse", first - second, 1e-9)
 
 
-@pytest.mark.parametrize("friction", slow_but((0.5,), (None, 0.5)))
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", (None, 0.5))
 def test_derivative_agrees_with_that_of_the_sweeps(float64, friction, gate):
     """Where the sweeps converge as well, both differentiate the same fixed point."""
     jacobian, inverse_mass, free = random_problem(3, friction=friction is not None)

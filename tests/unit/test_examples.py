@@ -10,6 +10,8 @@ from tests.fit.scenes import RADIUS, bounce_height
 from tests.status import ROOT
 
 PAGES = sorted(ROOT.glob("docs/*.md"))
+LONG = {"environments"}
+"""Compiles the programs of three environments; each of what it shows has tests in `tests/envs`."""
 
 
 def blocks(page):
@@ -19,7 +21,11 @@ def blocks(page):
 def programs():
     """Each example of the README stands alone; those of a page continue one another."""
     readme = [pytest.param(code, id=f"README {place}") for place, code in enumerate(blocks(ROOT / "README.md"))]
-    return readme + [pytest.param("\n".join(blocks(page)), id=page.stem) for page in PAGES if blocks(page)]
+    pages = [page for page in PAGES if blocks(page)]
+    return readme + [
+        pytest.param("\n".join(blocks(page)), id=page.stem, marks=pytest.mark.slow if page.stem in LONG else ())
+        for page in pages
+    ]
 
 
 @pytest.fixture

@@ -41,6 +41,7 @@ def test_a_rod_that_can_not_reach_is_flagged(solver):
         assert int(final.flags) == flag and np.isfinite(np.asarray(final.velocity)).all()
 
 
+@pytest.mark.slow
 def test_only_its_own_world_is_flagged():
     model, state = posts(*FEET, rod(1.0))
     models = repeat(model, 3)

@@ -159,12 +159,12 @@ def test_interpolation_has_finite_gradients_where_nothing_moved(float64):
     assert all(np.isfinite(part).all() for part in gradient)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scene",
     [
         pytest.param(slab_on_plane, id="slab"),
-        pytest.param(lambda **k: box_stack(2, **k), id="stack", marks=pytest.mark.slow),
+        pytest.param(lambda **k: box_stack(2, **k), id="stack"),
     ],
 )
 def test_zero_time_step_changes_nothing(precision, scene):

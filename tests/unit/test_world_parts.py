@@ -74,6 +74,7 @@ def test_worlds_are_those_of_small_batches(float64, name):
     np.testing.assert_allclose(mapped(batch), np.concatenate(small), rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_by_what_all_worlds_share(float64):
     """A friction that belongs to no world gets the sum over all parts."""
     batch = speeds()
