@@ -23,7 +23,7 @@ from mathota_jax.collision.box_axes import relative_rotation
 from mathota_jax.collision.closest import clamp
 from mathota_jax.collision.manifold import Nearest
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.settle import compute_once, settle_code
+from mathota_jax.spatial.settle import compute_once, settle, settle_code
 from mathota_jax.spatial.vector import Vec3, dot, where
 
 ROUNDING = 8.0
@@ -62,10 +62,10 @@ def box_distance(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pos
     c = relative_rotation(pose_a.rotation, pose_b.rotation)
     t, t_b = pose_a.rotation.apply_transposed(between), pose_b.rotation.apply_transposed(between)
     boxes = _Boxes(c, t, t_b, a["half_extents"], b["half_extents"])
-    code = _search(lax.stop_gradient(boxes))
+    code, on_face = _search(lax.stop_gradient(boxes))
     on_edges = code >= EDGES
     of_a = ~on_edges & ((code >> 6) & 1 == 1)
-    corner, edge = _corner_contact(boxes, code, of_a), _edge_contact(boxes, code)
+    corner, edge = _corner_contact(boxes, code, of_a, on_face), _edge_contact(boxes, code)
     normal = where(on_edges, edge.normal, corner.normal)
     separation = jnp.where(on_edges, edge.separation, corner.separation)
     own, other = where(on_edges, edge.own, corner.own), where(on_edges, edge.other, corner.other)
@@ -86,25 +86,31 @@ def box_distance(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pos
 # ---- the search, not differentiated -------------------------------------------------------------------------------
 
 
-def _search(boxes: _Boxes) -> Array:
-    """The code of the closest features, settled."""
+def _search(boxes: _Boxes) -> tuple[Array, Vec3]:
+    """The code of the closest features, settled; and where the box that meets a face does so, if one is closest.
+
+    A point over the face that separates best is closest: its distance is that lower bound. Where edges lie on the face no
+    other feature is sure to tell: which of the edges that tie cross, round-off decides.
+    """
     c, t, t_b, half_a, half_b = boxes
     number = c[0][0].dtype
     eps = float(jnp.finfo(number).eps)
     size = jnp.maximum(half_a.x, jnp.maximum(half_a.y, half_a.z))
     size = jnp.maximum(size, jnp.maximum(half_b.x, jnp.maximum(half_b.y, half_b.z)))
     face, face_code = _best_face(boxes)
+    face_code = settle(face_code)
+    place, over_face = _place_on_face(boxes, face_code.astype(jnp.int32))
     edge, edge_code, crossed_code = _best_edges(boxes)
     crossed = crossed_code > 0
     corner_b = _nearest_corner(Vec3(*t), c, half_b, half_a)
     corner_a = _nearest_corner(-t_b, [list(row) for row in zip(*c, strict=True)], half_a, half_b)
     of_a = corner_a[0] < corner_b[0]
     gap, corner_code = jnp.where(of_a, corner_a[0], corner_b[0]), jnp.where(of_a, 64.0 + corner_a[1], corner_b[1])
-    apart_code = jnp.where(crossed, crossed_code, corner_code)
+    apart_code = jnp.where(over_face & (face > 0), face_code, jnp.where(crossed, crossed_code, corner_code))
     overlap_code = jnp.where(edge > face + ROUNDING * eps * size, edge_code, face_code)
     # A corner that touches gives no direction: then the axis does.
     apart = (jnp.maximum(face, edge) > 0) & (crossed | (gap > (16.0 * eps * size) ** 2))
-    return settle_code(jnp.where(apart, apart_code, overlap_code))
+    return settle_code(jnp.where(apart, apart_code, overlap_code)), place
 
 
 def _best_face(boxes: _Boxes) -> tuple[Array, Array]:
@@ -125,6 +131,29 @@ def _best_face(boxes: _Boxes) -> tuple[Array, Array]:
                 better = separation > best
                 best, code = jnp.where(better, separation, best), jnp.where(better, this, code)
     return best, code
+
+
+def _place_on_face(boxes: _Boxes, code: Array) -> tuple[Vec3, Array]:
+    """Coordinates in [-1, 1] along the axes of the other box of a point that is deepest, and whether the face is below it.
+
+    Edges and faces that lie on the face: any of their points is deepest, one over the face is the witness.
+    """
+    shapes, signs, axis, _ = _corner_features(boxes, code, (code >> 6) & 1 == 1)
+    tied = TIED_ROUNDING * float(jnp.finfo(signs.x.dtype).eps)
+    free = [jnp.abs(_entry(axis, column)) <= tied for column in shapes.axes]
+    shapes = _in_every_pair(shapes, signs.x)
+    place = lax.cond(
+        jnp.any(free[0] | free[1] | free[2]),
+        _over_face,
+        lambda _shapes, _axis, signs, _free: signs,
+        shapes,
+        axis,
+        signs,
+        free,
+    )
+    point = shapes.point(place)
+    over = [(axis == k) | (jnp.abs(at) <= half) for k, (at, half) in enumerate(zip(point, shapes.half, strict=True))]
+    return place, over[0] & over[1] & over[2]
 
 
 def _best_edges(boxes: _Boxes) -> tuple[Array, Array, Array]:
@@ -227,39 +256,35 @@ class _Shapes(NamedTuple):
     half: Vec3
     arm: Vec3
 
+    def point(self, place: Vec3) -> Vec3:
+        """The point of the other box at the coordinates `place`, in [-1, 1], along its axes."""
+        point = self.center
+        for column, length, at in zip(self.axes, self.arm, place, strict=True):
+            point = point + column * (length * at)
+        return point
+
 
 def _in_every_pair(tree: Any, like: Array) -> Any:
     return jax.tree.map(lambda x: jnp.broadcast_to(x, like.shape), tree)
 
 
-def _corner_contact(boxes: _Boxes, code: Array, of_a: Array) -> _Contact:
-    """A corner of one box at a face of the other, or at its closest point."""
+def _corner_features(boxes: _Boxes, code: Array, of_a: Array) -> tuple[_Shapes, Vec3, Array, Array]:
+    """What `code` names of a corner and what it meets: the boxes, signs of the corner, axis and side of the face."""
     number = boxes.t.x.dtype
-    eps = float(jnp.finfo(number).eps)
     signs = Vec3(*(_sign((code >> k) & 1, number) for k in range(3)))
-    axis, side = (code >> 3) & 3, _sign((code >> 5) & 1, number)
-    on_face = axis != CORNER
     half = where(of_a, boxes.half_b, boxes.half_a)
     arm = where(of_a, boxes.half_a, boxes.half_b)
     center = where(of_a, -boxes.t_b, boxes.t)
     axes = [Vec3(*(jnp.where(of_a, boxes.c[j][i], boxes.c[i][j]) for i in range(3))) for j in range(3)]
+    return _Shapes(center, axes, half, arm), signs, (code >> 3) & 3, _sign((code >> 5) & 1, number)
 
-    # Edges and faces that lie on the face: any of their points is deepest, one over the face is the witness.
-    heights = [lax.stop_gradient(_entry(axis, column)) for column in axes]
-    free = [on_face & (jnp.abs(height) <= TIED_ROUNDING * eps) for height in heights]
-    shapes = _in_every_pair(lax.stop_gradient(_Shapes(center, axes, half, arm)), signs.x)
-    place = lax.cond(
-        jnp.any(free[0] | free[1] | free[2]),
-        _over_face,
-        lambda _shapes, _axis, signs, _free: signs,
-        shapes,
-        axis,
-        signs,
-        free,
-    )
-    other = center
-    for column, length, sign in zip(axes, arm, place, strict=True):
-        other = other + column * (length * sign)
+
+def _corner_contact(boxes: _Boxes, code: Array, of_a: Array, place: Vec3) -> _Contact:
+    """A corner of one box at the closest point of the other, or what is at `place` at a face."""
+    shapes, signs, axis, side = _corner_features(boxes, code, of_a)
+    half = shapes.half
+    on_face = axis != CORNER
+    other = shapes.point(where(on_face, place, signs))
 
     on = [axis == k for k in range(3)]
     own = Vec3(

@@ -71,7 +71,8 @@ def tied_scene():
     for index, ((half_a, half_b), turn, (aside, across), gap) in enumerate(rows):
         height = half_a[1] + np.abs(turns[turn].as_matrix()[1]) @ half_b + gap
         scene["pb"][index] = aside, height, 0.4 * aside * across
-    whole = Rotation.from_rotvec((0.3, -0.4, 0.2))
+    # Turned as a whole, each in its own way: round-off decides ties by chance, and not twice in the same way.
+    whole = Rotation.random(count, rng=np.random.default_rng(5))
     scene["pb"] = whole.apply(scene["pb"])
     for name in ("qa", "qb"):
         scene[name] = (whole * Rotation.from_quat(scene[name][:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
