@@ -2,11 +2,15 @@
 
 XLA copies cheap shared expressions into every kernel that uses them and contracts multiply-add pairs differently in
 each copy. A comparison that depends on such an expression can then come out *both ways* inside one step: one output
-sees branch A, the next one branch B. The cure: reduce a discrete choice to one number, pass that number through an
-operation that XLA never copies (a division) and cannot fold away, and select every output from the result.
+sees branch A, the next one branch B. The cure: reduce a discrete choice to one number, keep XLA from computing that
+number more than once, and select every output from the result.
+
+How XLA is kept from it depends on the device. On CPUs optimisation barriers are gone before expressions are fused, but a
+division is never copied, nor is a conditional. On GPUs divisions are copied like anything else, but barriers hold.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -20,11 +24,10 @@ from jax.interpreters import ad, batching, mlir
 def settle(decision: Array) -> Array:
     """Returns the finite number `decision` unchanged, computed exactly once. Elementwise, floating point, any shape.
 
-    The divisor is 1 for every finite input, but XLA does not know that. The derivative is zero: a decision is discrete.
+    The derivative is zero: a decision is discrete.
     """
     decision = lax.stop_gradient(decision)
-    opaque_one = decision * 0 + 1  # not foldable: a float times 0 need not be 0
-    return decision / opaque_one
+    return store(decision, decision)
 
 
 def settle_code(decision: Array) -> Array:
@@ -36,32 +39,64 @@ def compute_once(values: Any, like: Array) -> Any:
     """Keeps XLA from recomputing each array of the pytree `values` in every kernel that uses it.
 
     XLA copies cheap expressions into all their consumers, so that a rotation matrix is rebuilt in a hundred kernels and a
-    chain of n dependent rows costs 2^n. It never copies a division. Values and derivatives are unchanged.
+    chain of n dependent rows costs 2^n. Values and derivatives are unchanged.
 
     Args:
-        values: Pytree of finite floating-point arrays.
-        like: Array whose last axis is that of the worlds. A value that all worlds share is left alone: storing it would
-            cost a kernel, while computing it again costs nothing beside what is done for each world.
+        values: Pytree of finite arrays; integers must be exact in the type of `like`.
+        like: Floating-point array whose last axis is that of the worlds. A value that all worlds share is left alone:
+            storing it would cost a kernel, while computing it again costs nothing beside what is done for each world.
     """
     worlds = like.shape[-1]
 
-    def once(value: Array) -> Array:
-        shared = worlds > 1 and jnp.shape(value)[-1:] in ((), (1,))
-        return value if shared else store(value, value)
+    def once(value: Array | float) -> Array | float:
+        if not isinstance(value, Array) or (worlds > 1 and value.shape[-1:] in ((), (1,))):
+            return value
+        number = value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(like.dtype)
+        return store(number, number).astype(value.dtype)
 
     return jax.tree.map(once, values)
 
 
 def store(value: Array, source: Array) -> Array:
-    """Returns `value` unchanged, computed exactly once.
+    """Returns `value` unchanged, computed exactly once, and so are its tangents and cotangents.
 
     Args:
         value: Floating-point array.
-        source: Finite array of the same shape from which the divisor is made. It may be `value` itself, unless `value`
+        source: Finite array of the same shape from which CPUs make a divisor. It may be `value` itself, unless `value`
             has to stay linear in something. (XLA turns a division by a broadcast scalar into a product, which it copies;
             so the divisor needs the full shape.)
     """
-    return value / (lax.stop_gradient(source) * 0 + 1)
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"store: the array must be of floating point, got {value.dtype}")
+    value, source = jnp.broadcast_arrays(value, lax.stop_gradient(source))
+    return _store_p.bind(value, source.astype(value.dtype))
+
+
+def _store_by_division(value: Array, source: Array) -> Array:
+    """The divisor is 1 for every finite number, but XLA does not know that: a float times 0 need not be 0."""
+    return value / (source * 0 + 1)
+
+
+def _jvp_store(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Any]:
+    (value, source), tangent = primals, tangents[0]
+    stored = tangent if type(tangent) is ad.Zero else _store_p.bind(tangent, source)
+    return _store_p.bind(value, source), stored
+
+
+def _transpose_store(cotangent: Any, value: Any, source: Array) -> list[Any]:
+    return [ad.Zero(value.aval) if type(cotangent) is ad.Zero else _store_p.bind(cotangent, source), None]
+
+
+_store_p = Primitive("store")
+_store_p.def_impl(lambda value, _: value)
+_store_p.def_abstract_eval(lambda value, _: ShapedArray(value.shape, value.dtype))
+ad.primitive_jvps[_store_p] = _jvp_store
+ad.primitive_transposes[_store_p] = _transpose_store
+batching.defbroadcasting(_store_p)
+mlir.register_lowering(
+    _store_p, mlir.lower_fun(lambda value, _: lax.optimization_barrier(value), multiple_results=False)
+)
+mlir.register_lowering(_store_p, mlir.lower_fun(_store_by_division, multiple_results=False), platform="cpu")
 
 
 def store_cotangents(values: Any, *, for_one_reader: bool = False) -> Any:
@@ -79,32 +114,40 @@ def store_cotangents(values: Any, *, for_one_reader: bool = False) -> Any:
     return jax.tree.unflatten(tree, _store_cotangents_p.bind(*leaves, for_one_reader=for_one_reader))
 
 
+def _of_the_others(function: Callable[..., Sequence[Any]], values: Sequence[Any]) -> list[Any]:
+    """The function of those tangents or cotangents that are not zero in any case."""
+    found = list(values)
+    places = [place for place, value in enumerate(values) if type(value) is not ad.Zero]
+    if places:
+        for place, new in zip(places, function(*(values[place] for place in places)), strict=True):
+            found[place] = new
+    return found
+
+
+def _zeros_of(cotangents: Sequence[Any], arrays: Sequence[Any]) -> list[Any]:
+    """The cotangents, of which those that are zero in any case have the shapes of the arrays."""
+    return [ad.Zero(x.aval) if type(c) is ad.Zero else c for c, x in zip(cotangents, arrays, strict=True)]
+
+
 def _jvp_store_cotangents(
     primals: Sequence[Array], tangents: Sequence[Any], *, for_one_reader: bool
 ) -> tuple[list[Array], list[Any]]:
-    found = list(tangents)
-    places = [place for place, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
-    stored = _store_cotangents_p.bind(*(tangents[place] for place in places), for_one_reader=for_one_reader)
-    for place, tangent in zip(places, stored, strict=True):
-        found[place] = tangent
-    return list(primals), found
+    bind = functools.partial(_store_cotangents_p.bind, for_one_reader=for_one_reader)
+    return list(primals), _of_the_others(bind, tangents)
 
 
 def _transpose_store_cotangents(cotangents: Sequence[Any], *arrays: Any, for_one_reader: bool) -> list[Any]:
-    found: list[Any] = [
-        ad.Zero(array.aval) if type(c) is ad.Zero else c for c, array in zip(cotangents, arrays, strict=True)
-    ]
-    places = [place for place, cotangent in enumerate(found) if type(cotangent) is not ad.Zero]
-    if not for_one_reader:
-        for place in places:
-            found[place] = store(found[place], found[place])
-        return found
-    # Those of one shape together: a conditional has its price.
-    for shape in sorted({found[place].shape for place in places}):
-        group = [place for place in places if found[place].shape == shape]
-        for place, stored in zip(group, materialize([found[place] for place in group]), strict=True):
-            found[place] = stored
-    return found
+    def stored(*cotangents: Array) -> list[Array]:
+        if not for_one_reader:
+            return [store(c, c) for c in cotangents]
+        found: dict[int, Array] = {}
+        # Those of one shape together: a conditional has its price.
+        for shape in sorted({c.shape for c in cotangents}):
+            group = {place: c for place, c in enumerate(cotangents) if c.shape == shape}
+            found.update(materialize(group))
+        return [found[place] for place in range(len(cotangents))]
+
+    return _of_the_others(stored, _zeros_of(cotangents, arrays))
 
 
 _store_cotangents_p = Primitive("store_cotangents")
@@ -121,20 +164,55 @@ mlir.register_lowering(_store_cotangents_p, mlir.lower_fun(lambda *arrays, **_: 
 
 
 def materialize(values: Any) -> Any:
-    """Stores every array of a pytree, and in reverse mode its cotangent, before anything else reads it.
+    """Stores every array of a pytree, and its tangents and cotangents, before anything else reads it.
 
     `compute_once` can not help where a single consumer is the problem: a concatenation of long expressions is compiled
-    to one kernel that branches for every element. A conditional is never fused. Its predicate is true, since no square is
-    2 or 3 modulo 4; its other branch returns every array in the place of another, or the negative of a single one, or JAX
-    would forward them unstored.
+    to one kernel that branches for every element.
 
     Args:
         values: Pytree of finite arrays, all of the same shape but for the number of worlds.
     """
     leaves, tree = jax.tree.flatten(values)
-    leaves = jnp.broadcast_arrays(*leaves)
+    return jax.tree.unflatten(tree, _materialize_p.bind(*jnp.broadcast_arrays(*leaves)))
+
+
+def _materialize_by_condition(*leaves: Array) -> tuple[Array, ...]:
+    """A conditional is never fused.
+
+    Its predicate is true, since no square is 2 or 3 modulo 4; its other branch returns every array in the place of
+    another, or the negative of a single one, or JAX would forward them unstored.
+    """
     bits = lax.bitcast_convert_type(leaves[0].reshape(-1)[0].astype(jnp.float32), jnp.int32)
     always = ((bits * bits) & 3) < 2
     other = (lambda first, *rest: (*rest, first)) if len(leaves) > 1 else (lambda first: (-first,))
-    stored = lax.cond(always, lambda *x: x, other, *leaves)
-    return jax.tree.unflatten(tree, stored)
+    return lax.cond(always, lambda *x: x, other, *leaves)
+
+
+def _jvp_materialize(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[list[Array], list[Any]]:
+    return _materialize_p.bind(*primals), _of_the_others(_materialize_p.bind, tangents)
+
+
+def _transpose_materialize(cotangents: Sequence[Any], *arrays: Any) -> list[Any]:
+    return _of_the_others(_materialize_p.bind, _zeros_of(cotangents, arrays))
+
+
+def _batch_materialize(arrays: Sequence[Array], axes: Sequence[int | None]) -> tuple[list[Array], list[int]]:
+    size = next(array.shape[axis] for array, axis in zip(arrays, axes, strict=True) if axis is not None)
+    moved = [
+        jnp.broadcast_to(array, (size, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
+        for array, axis in zip(arrays, axes, strict=True)
+    ]
+    return _materialize_p.bind(*moved), [0] * len(moved)
+
+
+_materialize_p = Primitive("materialize")
+_materialize_p.multiple_results = True
+_materialize_p.def_impl(lambda *arrays: list(arrays))
+_materialize_p.def_abstract_eval(lambda *arrays: [ShapedArray(x.shape, x.dtype) for x in arrays])
+ad.primitive_jvps[_materialize_p] = _jvp_materialize
+ad.primitive_transposes[_materialize_p] = _transpose_materialize
+batching.primitive_batchers[_materialize_p] = _batch_materialize
+mlir.register_lowering(
+    _materialize_p, mlir.lower_fun(lambda *arrays: lax.optimization_barrier(arrays), multiple_results=True)
+)
+mlir.register_lowering(_materialize_p, mlir.lower_fun(_materialize_by_condition, multiple_results=True), platform="cpu")

@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from mathota_jax.bodies import Inertia
 from mathota_jax.dynamics.free_motion import PARTS, rotate_at_constant_momentum
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
-from mathota_jax.spatial.settle import settle, store_cotangents
+from mathota_jax.spatial.settle import compute_once, materialize, settle, store, store_cotangents
 from mathota_jax.spatial.vector import Vec3
 
 
@@ -49,6 +49,27 @@ def test_values_and_derivatives_of_any_order_are_unchanged(float64):
     np.testing.assert_array_equal(product(matrix, vector), jnp.sin(matrix @ jnp.cos(vector)))
     check_grads(product, (matrix, vector), order=2, rtol=1e-6)
     check_grads(jax.vmap(product, in_axes=(None, 1)), (matrix, vector), order=1, rtol=1e-6)
+
+
+def test_what_is_stored_keeps_its_type():
+    like, kinds = jnp.ones(3), (jnp.float32, jnp.int32, jnp.bool_)
+    values = [jnp.asarray([0, 1, 2]).astype(kind) for kind in kinds]
+    for value, found in zip(values, jax.jit(lambda v: compute_once(v, like))(values), strict=True):
+        assert found.dtype == value.dtype
+        np.testing.assert_array_equal(found, value)
+    with pytest.raises(TypeError, match="floating point, got int32"):
+        store(values[1], values[1])
+
+
+def test_on_gpus_barriers_hold_what_divisions_do_not():
+    """XLA copies divisions there, and has no barriers any more when it fuses for CPUs: seen in the programs of both."""
+
+    def text(platform):
+        traced = jax.jit(lambda x: settle(x) + materialize([x, x + 1])[1]).trace(jnp.ones(3))
+        return traced.lower(lowering_platforms=(platform,)).as_text()
+
+    assert text("cuda").count("optimization_barrier") == 2 and "divide" not in text("cuda")
+    assert "optimization_barrier" not in text("cpu") and "divide" in text("cpu") and "case" in text("cpu")
 
 
 def test_the_value_itself_costs_nothing():
