@@ -326,6 +326,4 @@ def _sum(rows: Array, impulse: Array, together: int) -> Array:
 
 def sum_over_points(values: Array, together: int) -> Array:
     """(component, constraint, world) from (component, column, world)."""
-    if together == 1:
-        return values
-    return functools.reduce(jnp.add, unstack(values.reshape(values.shape[0], -1, together, values.shape[-1]), 2))
+    return values if together == 1 else add_slices(values.reshape(values.shape[0], -1, together, values.shape[-1]), 2)

@@ -18,10 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from mathota_jax.solver import visits
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import RowMatrix
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
+from mathota_jax.spatial.by_platform import by_platform
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.settle import store
@@ -195,6 +197,19 @@ def visiting_all_turns(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
     )
 
 
+def visited(group: Rows, values: Any, apart: bool) -> visits.Group:
+    """The constraints of a group with some values of theirs; see `visits.Group`."""
+    table = group.table
+    if group.places is None:
+        sides = [np.asarray(side, np.int32)[:, :: table.together, None] for side in table.blocks]
+        blocks, turns = tuple(jnp.asarray(side) for side in sides), table.turn_count
+    else:
+        blocks, turns = group.places.blocks, group.places.turns
+        turns = table.turn_count if turns is None else turns
+    count = jnp.asarray(turns * table.constraint_count)
+    return visits.Group(values, blocks, count, table.constraint_count, table.together, apart)
+
+
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
     """Velocity plus ``M^-1 J^T`` times impulses, over all groups."""
     for group, impulse in zip(rows, impulses, strict=True):
@@ -260,14 +275,26 @@ def _by_turn(tree: Any) -> list[Any]:
 def _add_at_filled_places(together: int, places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
     """`add_changes` over those turns that hold a constraint; that loop has no reverse mode."""
 
-    def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        turn, velocity = carry
-        blocks, part, values = counter.row((places.blocks, matrix, impulse), turn)
-        # Stored: a kernel that reads rows of two arrays takes the scalar index that it should not (see `counter`).
-        changes = part.changes(store(values, values), together)
-        return counter.following(turn), receive(velocity, blocks, changes)
+    def by_turns(places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
+        def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+            turn, velocity = carry
+            blocks, part, values = counter.row((places.blocks, matrix, impulse), turn)
+            # Stored: a kernel that reads rows of two arrays takes the scalar index that it should not (see `counter`).
+            changes = part.changes(store(values, values), together)
+            return counter.following(turn), receive(velocity, blocks, changes)
 
-    return lax.fori_loop(0, places.turns, body, (counter.start(), velocity))[1]
+        return lax.fori_loop(0, places.turns, body, (counter.start(), velocity))[1]
+
+    def in_one_kernel(places: Places, matrix: Changes, velocity: Array, impulse: Array) -> Array:
+        def answer(_: Array, __: list[Array], values: Changes, impulse: Array) -> tuple[list[Array], Array]:
+            return values.changes(impulse, impulse.shape[1]), impulse
+
+        constraints = places.blocks[0].shape[1]
+        count = jnp.asarray(places.turns) * constraints
+        group = visits.Group(matrix, places.blocks, count, constraints, together, True)
+        return visits.run(1, [answer], (group,), velocity, (impulse,))[0]
+
+    return by_platform(by_turns, in_one_kernel, velocity, places, matrix, velocity, impulse)
 
 
 @_add_at_filled_places.defjvp

@@ -9,6 +9,7 @@ twice. Measured for a cube with the steps of `pgs`: such a sweep multiplies what
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,11 +17,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from mathota_jax.solver import visits
 from mathota_jax.solver.laws import Cone, Law
 from mathota_jax.solver.row_matrix import RowMatrix
-from mathota_jax.solver.rows import UNROLLED_TURNS, Rows, gather, receive
+from mathota_jax.solver.rows import UNROLLED_TURNS, Rows, gather, receive, visited
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
+from mathota_jax.spatial.by_platform import by_platform
 from mathota_jax.spatial.settle import store
 
 
@@ -56,8 +59,9 @@ def run(
     biases: tuple[Array, ...],
     velocity: Array,
     impulses: tuple[Array, ...],
+    apart: bool = True,
 ) -> tuple[Array, tuple[Array, ...]]:
-    """A number of sweeps, whose derivative is that of every update.
+    """A number of sweeps, for use inside of custom derivatives.
 
     Args:
       iterations: that number.
@@ -66,17 +70,58 @@ def run(
       coefficients: what the update gets of each group, with a leading turn axis.
       biases, impulses: of each group (turn, row, column, world).
       velocity: (component, block, world) with those impulses.
+      apart: whether an update looks at each column by itself.
 
     Returns:
       The velocity and the impulses after the sweeps.
     """
+    args = (rows, coefficients, biases, velocity, impulses)
+    one_by_one = functools.partial(by_turns, iterations, update)
+    in_one_kernel = functools.partial(_in_one_kernel, iterations, update, apart)
+    return by_platform(one_by_one, in_one_kernel, (velocity, impulses), *args)
+
+
+def by_turns(
+    iterations: int,
+    update: Callable[[Array | int], Update],
+    rows: tuple[Rows, ...],
+    coefficients: tuple[object, ...],
+    biases: tuple[Array, ...],
+    velocity: Array,
+    impulses: tuple[Array, ...],
+) -> tuple[Array, tuple[Array, ...]]:
+    """`run` turn by turn, on any device. Its derivative is that of every update."""
 
     def sweep(number: Array | int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
         return once(rows, update(number), coefficients, biases, *carry)
 
-    if iterations == 1:
-        return sweep(0, (velocity, impulses))
-    return lax.fori_loop(0, iterations, sweep, (velocity, impulses))
+    start = (velocity, impulses)
+    return sweep(0, start) if iterations == 1 else lax.fori_loop(0, iterations, sweep, start)
+
+
+def _in_one_kernel(
+    iterations: int,
+    update: Callable[[Array | int], Update],
+    apart: bool,
+    rows: tuple[Rows, ...],
+    coefficients: tuple[object, ...],
+    biases: tuple[Array, ...],
+    velocity: Array,
+    impulses: tuple[Array, ...],
+) -> tuple[Array, tuple[Array, ...]]:
+    """`run` on a GPU."""
+
+    def answer_of(group: Rows) -> visits.Answer:
+        def answer(number: Array, moving: list[Array], values: tuple, impulse: Array) -> tuple[list[Array], Array]:
+            return _answer(group.law, update(number), impulse.shape[1], moving, (*values, impulse))
+
+        return answer
+
+    groups = tuple(
+        visited(group, (group.matrix, bias, coefficient), apart)
+        for group, bias, coefficient in zip(rows, biases, coefficients, strict=True)
+    )
+    return visits.run(iterations, [answer_of(group) for group in rows], groups, velocity, impulses)
 
 
 def once(
@@ -145,8 +190,14 @@ def _turn(
     law: Law, update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
 ) -> tuple[Array, Array]:
     """Solves the rows of one turn side by side."""
-    matrix, bias, coefficients, impulse = values
     moving = [gather(velocity, side, together) for side in blocks]
+    changes, new = _answer(law, update, together, moving, values)
+    return receive(velocity, receivers, changes), new
+
+
+def _answer(law: Law, update: Update, together: int, moving: list[Array], values: tuple) -> tuple[list[Array], Array]:
+    """How the velocity (component, constraint, world) of each side changes, and the new impulses of a turn."""
+    matrix, bias, coefficients, impulse = values
     # Errors and impulses are stored: what is not is computed again by all that reads it, of the later turns, too.
     if isinstance(law, Cone):
         first, others = matrix.first_row(), matrix.other_rows()
@@ -159,7 +210,7 @@ def _turn(
         error = store(bias[1:] + others.rates(moving), others.like)
         held = store(update.others(coefficients, bias, impulse, normal, error), others.like)
         changes = [a + b for a, b in zip(pushed, others.changes(held - impulse[1:], together), strict=True)]
-        return receive(velocity, receivers, changes), jnp.concatenate([normal, held])
+        return changes, jnp.concatenate([normal, held])
     error = store(bias + matrix.rates(moving), matrix.like)
     new = store(update.at_once(coefficients, bias, impulse, error), matrix.like)
-    return receive(velocity, receivers, matrix.changes(new - impulse, together)), new
+    return matrix.changes(new - impulse, together), new

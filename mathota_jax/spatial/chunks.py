@@ -13,6 +13,7 @@ from jax import Array, lax
 from jax.core import eval_jaxpr
 
 from mathota_jax.spatial import counter
+from mathota_jax.spatial.by_platform import by_platform
 
 FEWEST, MOST = 5, 12
 """Rows computed at a time: few enough to leave out most of an empty table, many enough to keep a single world busy."""
@@ -67,14 +68,23 @@ def _without_closure(function: Callable[[Any], Any], example: Any) -> tuple[Call
 def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used: Array) -> Any:
     """`function(chunk, *constants)` of the chunks in use, stacked, and 0 elsewhere."""
 
-    def body(_: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        k, results = carry
-        found = function(counter.row(chunks, k), *constants)
-        return counter.following(k), jax.tree.map(lambda all_, x: counter.put(all_, x, k), results, found)
+    def one_after_the_other(constants: Any, chunks: Any, used: Array) -> Any:
+        def body(_: Array, carry: tuple[Array, Any]) -> tuple[Array, Any]:
+            k, results = carry
+            found = function(counter.row(chunks, k), *constants)
+            return counter.following(k), jax.tree.map(lambda all_, x: counter.put(all_, x, k), results, found)
 
-    chunk = jax.tree.map(lambda x: x[0], chunks)
-    zeros = _zeros(function, constants, chunk, jax.tree.leaves(chunks)[0].shape[:1])
-    return lax.fori_loop(0, used, body, (counter.start(), zeros))[1]
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+        return lax.fori_loop(0, used, body, (counter.start(), zeros))[1]
+
+    def at_once(constants: Any, chunks: Any, used: Array) -> Any:
+        # A GPU waits longer for the end of a loop to be known than for the work on what is empty.
+        found = jax.vmap(lambda chunk: function(chunk, *constants))(chunks)
+        return jax.tree.map(lambda x: jnp.where(_leading(jnp.arange(len(x)) < used, x), x, jnp.zeros_like(x)), found)
+
+    count, chunk = len(jax.tree.leaves(chunks)[0]), jax.tree.map(lambda x: x[0], chunks)
+    shapes = _shapes(function, constants, chunk, count)
+    return by_platform(one_after_the_other, at_once, shapes, constants, chunks, used)
 
 
 @_map_chunks.defjvp
@@ -93,10 +103,21 @@ def _map_chunks_jvp(function: Callable[..., Any], primals: tuple, tangents: tupl
     return jax.jvp(every_chunk, primals, tangents)
 
 
-def _zeros(function: Callable[..., Any], constants: Any, chunk: Any, leading: tuple[int, ...] = ()) -> Any:
-    """Zeros of the shapes that the function gives for a chunk, with further axes in front."""
+def _shapes(function: Callable[..., Any], constants: Any, chunk: Any, count: int) -> Any:
+    """What the function gives for `count` chunks."""
     shapes = jax.eval_shape(function, chunk, *constants)
-    return jax.tree.map(lambda x: jnp.zeros((*leading, *x.shape), x.dtype), shapes)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), shapes)
+
+
+def _zeros(function: Callable[..., Any], constants: Any, chunk: Any) -> Any:
+    """Zeros of the shapes that the function gives for a chunk."""
+    shapes = jax.eval_shape(function, chunk, *constants)
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def _leading(values: Array, like: Array) -> Array:
+    """Values (row,) as (row, 1, ...), with as many axes as `like`."""
+    return values.reshape(-1, *(1,) * (like.ndim - 1))
 
 
 def _chunk_count(count: int) -> int:

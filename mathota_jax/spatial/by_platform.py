@@ -1,0 +1,58 @@
+"""One result, two ways to it: what is best on a CPU and what is best on a GPU are different programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax import Array
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
+
+GPU = "cuda"
+"""The platform with a way of its own."""
+
+
+def by_platform(anywhere: Callable[..., Any], on_gpu: Callable[..., Any], result: Any, *args: Any) -> Any:
+    """`anywhere(*args)`, or `on_gpu(*args)` in programs for GPUs.
+
+    Only the one that is compiled is traced, when that is known. Not differentiable: for use inside of custom derivatives.
+
+    Args:
+      anywhere: function of pytrees that closes over no traced array.
+      on_gpu: another with the same result.
+      result: pytree of what has the shapes and types of the result.
+      *args: pytrees of arrays.
+    """
+    leaves, in_tree = jax.tree.flatten(args)
+    expected, out_tree = jax.tree.flatten(result)
+    found = _by_platform_p.bind(
+        *leaves,
+        anywhere=anywhere,
+        on_gpu=on_gpu,
+        in_tree=in_tree,
+        shapes=tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in expected),
+    )
+    return jax.tree.unflatten(out_tree, found)
+
+
+def _run(function: Callable[..., Any], in_tree: Any, leaves: tuple[Array, ...]) -> list[Array]:
+    return jax.tree.leaves(function(*jax.tree.unflatten(in_tree, leaves)))
+
+
+def _anywhere(*leaves: Array, anywhere: Callable[..., Any], in_tree: Any, **_: Any) -> list[Array]:
+    return _run(anywhere, in_tree, leaves)
+
+
+def _on_gpu(*leaves: Array, on_gpu: Callable[..., Any], in_tree: Any, **_: Any) -> list[Array]:
+    return _run(on_gpu, in_tree, leaves)
+
+
+_by_platform_p = Primitive("by_platform")
+_by_platform_p.multiple_results = True
+_by_platform_p.def_abstract_eval(lambda *_, shapes, **__: [ShapedArray(x.shape, x.dtype) for x in shapes])
+_by_platform_p.def_impl(_anywhere)
+mlir.register_lowering(_by_platform_p, mlir.lower_fun(_anywhere, multiple_results=True))
+mlir.register_lowering(_by_platform_p, mlir.lower_fun(_on_gpu, multiple_results=True), platform=GPU)
