@@ -12,6 +12,7 @@ from gymnasium.error import ResetNeeded
 from jax import Array
 
 from mathota_envs.base import Environment
+from mathota_envs.compilation import compiled_sooner
 from mathota_envs.frames import FrameMaker
 from mathota_envs.host import (
     checked_actions,
@@ -23,6 +24,8 @@ from mathota_envs.host import (
 )
 from mathota_envs.registration import resolve
 from mathota_envs.worlds import Worlds, start_world, step_world, world_keys
+
+_start_world, _step_world = compiled_sooner(start_world), compiled_sooner(step_world)
 
 
 class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -91,7 +94,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.np_random is not self._key_source:
             self._key_source = self.np_random
             self._key = world_keys(entropy_words(self._key_source)[None])[0]
-        world: Worlds = start_world(self.environment, self._key, checked_options)
+        world: Worlds = _start_world(self.environment, self._key, checked_options)
         self._key, self.env_state = world.key, world.env_state
         return writable(world.observation, self.observation_space.dtype), {}
 
@@ -111,7 +114,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self.env_state is None:
             raise ResetNeeded("call reset before step")
         action = checked_actions(action, self.action_space, type(self.environment).__name__)
-        self.env_state, transition = step_world(self.environment, self.env_state, action)
+        self.env_state, transition = _step_world(self.environment, self.env_state, action)
         return (
             writable(transition.observation, self.observation_space.dtype),
             float(transition.reward),
