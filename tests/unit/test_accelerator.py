@@ -29,13 +29,15 @@ def test_report_of_a_few_worlds(tmp_path, gate):
     assert found["rate"] > 0 and len(found["rates"]) == 2 and found["bytes_per_world"] > 0
     gate("error of the first bounce", found["error"], 1e-3)
     gate("worlds with a flag", found["flagged"], 0)
+    gate("off a CPU [m/s]", found["off_cpu"], 1e-6)
     assert "| bounce | mathota_jax | 8 | " in (tmp_path / "accelerator.md").read_text()
 
 
 def test_a_run_that_means_nothing_has_no_rate():
-    row = {"rate": None, "error": 1.0, "flagged": 1.0, "bytes_per_world": None, "compile_seconds": 1.0}
+    row = {"rate": None, "error": 1.0, "flagged": 1.0, "bytes_per_world": None, "compile_seconds": 1.0,
+           "off_cpu": None}  # fmt: skip
     report = {
         "date": "", "device": {"kind": "", "platform": "", "jax": ""}, "settings": {"dt": 1, "rounds": 1, "seconds": 1},
         "scenes": {"slide": [{"worlds": 4, "engines": {measure.OURS: row}}]},
     }  # fmt: skip
-    assert "| slide | mathota_jax | 4 | - | - | 1e+02 % | 1e+02 % | - | 1.0 |" in accelerator.markdown(report)
+    assert "| slide | mathota_jax | 4 | - | - | 1e+02 % | - | 1e+02 % | - | 1.0 |" in accelerator.markdown(report)

@@ -34,6 +34,7 @@ class Entry:
       compile_seconds: wall time until the first step is done [s].
       bytes_per_world: None where the engine does not say.
       final: () -> bodies after the last block, and the share of worlds that raised a flag.
+      off_cpu: () -> how far a step after the record is off that of a CPU [m/s]; None for peers.
     """
 
     block_of: Callable[[int], Block]
@@ -41,6 +42,7 @@ class Entry:
     compile_seconds: float
     bytes_per_world: float | None
     final: Callable[[], tuple[Motion, float]]
+    off_cpu: Callable[[], float] | None = None
     rates: list[float] = dataclasses.field(default_factory=list)
 
 
@@ -92,6 +94,7 @@ def _start(key: str, found: Scene, worlds: int) -> Entry:
         compile_seconds,
         program.bytes_per_world,
         lambda: _after(program, found, last[0], key),
+        (lambda: _off_cpu(plain, found)) if key == OURS else None,
     )
 
 
@@ -110,6 +113,16 @@ def _after(program: JaxProgram, found: Scene, steps: int, key: str) -> tuple[Mot
     final = program.after(steps, DT)
     flagged = float(np.mean(np.asarray(final[1].flags) != 0)) if key == OURS else 0.0
     return program.motion(final, min(found.worlds, program.count)), flagged
+
+
+def _off_cpu(plain: JaxProgram, found: Scene) -> float:
+    """Largest difference of the velocities after one more step from those that a CPU computes [m/s]."""
+    worlds = min(found.worlds, plain.count)
+    cpu = jax.local_devices(backend="cpu")[0]
+    here = plain.motion(plain.after(1, DT, plain.final), worlds).velocity
+    start, parameters = jax.device_put((jax.tree.map(lambda x: x[:worlds], plain.final), plain.parameters(DT)), cpu)
+    there = plain.motion(jax.jit(plain.step)(parameters, start), worlds).velocity
+    return float(np.abs(here - there).max())
 
 
 def _long_enough(entry: Entry, seconds: float) -> Block:
@@ -147,6 +160,7 @@ def _report(found: Scene, entry: Entry) -> dict[str, Any]:
         "rates": entry.rates,
         "error": float(found.judge(start, frames, DT).max()),
         "unit": found.unit,
+        "off_cpu": None if entry.off_cpu is None else entry.off_cpu(),
         "flagged": flagged,
         "compile_seconds": entry.compile_seconds,
         "bytes_per_world": entry.bytes_per_world,

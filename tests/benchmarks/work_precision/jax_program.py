@@ -71,10 +71,10 @@ class JaxProgram:
         self.final = states
         return stack(frames)
 
-    def after(self, steps: int, dt: float) -> Any:
-        """States a number of steps after the start."""
+    def after(self, steps: int, dt: float, start: Any = None) -> Any:
+        """States a number of steps after the start, or after other states."""
         with jax.enable_x64(self.double):
-            return self._compiled[0](self.parameters(dt), self.states, np.int32(steps))
+            return self._compiled[0](self.parameters(dt), self.states if start is None else start, np.int32(steps))
 
     def block(self, scene: Scene, dt: float) -> Block:
         """Runs the whole horizon."""
