@@ -74,8 +74,7 @@ def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used:
             found = function(counter.row(chunks, k), *constants)
             return counter.following(k), jax.tree.map(lambda all_, x: counter.put(all_, x, k), results, found)
 
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        return lax.fori_loop(0, used, body, (counter.start(), zeros))[1]
+        return lax.fori_loop(0, used, body, (counter.start(), _zeros(shapes)))[1]
 
     def at_once(constants: Any, chunks: Any, used: Array) -> Any:
         # A GPU waits longer for the end of a loop to be known than for the work on what is empty.
@@ -96,22 +95,20 @@ def _map_chunks_jvp(function: Callable[..., Any], primals: tuple, tangents: tupl
             return function(chunk, *constants)
 
         def body(k: Array, chunk: Any) -> tuple[Array, Any]:
-            return k + 1, lax.cond(k < used, evaluate, lambda chunk: _zeros(function, constants, chunk), chunk)
+            return k + 1, lax.cond(k < used, evaluate, lambda chunk: _zeros(_shapes(function, constants, chunk)), chunk)
 
         return lax.scan(body, jnp.zeros((), used.dtype), chunks)[1]
 
     return jax.jvp(every_chunk, primals, tangents)
 
 
-def _shapes(function: Callable[..., Any], constants: Any, chunk: Any, count: int) -> Any:
-    """What the function gives for `count` chunks."""
+def _shapes(function: Callable[..., Any], constants: Any, chunk: Any, *count: int) -> Any:
+    """What the function gives for a chunk, or for a number of them."""
     shapes = jax.eval_shape(function, chunk, *constants)
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), shapes)
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*count, *x.shape), x.dtype), shapes)
 
 
-def _zeros(function: Callable[..., Any], constants: Any, chunk: Any) -> Any:
-    """Zeros of the shapes that the function gives for a chunk."""
-    shapes = jax.eval_shape(function, chunk, *constants)
+def _zeros(shapes: Any) -> Any:
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
 
