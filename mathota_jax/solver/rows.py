@@ -197,8 +197,8 @@ def visiting_all_turns(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
     )
 
 
-def visited(group: Rows, values: Any, apart: bool) -> visits.Group:
-    """The constraints of a group with some values of theirs; see `visits.Group`."""
+def visited(group: Rows, values: Any) -> visits.Group:
+    """The constraints of a group with some values of theirs, for `visits.run`."""
     table = group.table
     if group.places is None:
         sides = [np.asarray(side, np.int32)[:, :: table.together, None] for side in table.blocks]
@@ -207,7 +207,7 @@ def visited(group: Rows, values: Any, apart: bool) -> visits.Group:
         blocks, turns = group.places.blocks, group.places.turns
         turns = table.turn_count if turns is None else turns
     count = jnp.asarray(turns * table.constraint_count)
-    return visits.Group(values, blocks, count, table.constraint_count, table.together, apart)
+    return visits.Group(values, blocks, count, table.constraint_count, table.together)
 
 
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
@@ -291,7 +291,7 @@ def _add_at_filled_places(together: int, places: Places, matrix: Changes, veloci
 
         constraints = places.blocks[0].shape[1]
         count = jnp.asarray(places.turns) * constraints
-        group = visits.Group(matrix, places.blocks, count, constraints, together, True)
+        group = visits.Group(matrix, places.blocks, count, constraints, together)
         return visits.run(1, [answer], (group,), velocity, (impulse,))[0]
 
     return by_platform(by_turns, in_one_kernel, velocity, places, matrix, velocity, impulse)

@@ -195,8 +195,8 @@ def _sweep(
     velocity: Array,
     impulses: tuple[Array, ...],
 ) -> tuple[Array, tuple[Array, ...]]:
-    # The points of a manifold answer to one another.
-    return sweeps.run(count, rows, lambda _: sweeps.of_law(), laws, biases, velocity, impulses, apart=False)
+    # Turn by turn on GPUs, too: the points of a manifold answer to one another.
+    return sweeps.by_turns(count, lambda _: sweeps.of_law(), rows, laws, biases, velocity, impulses)
 
 
 @_sweep.defjvp
@@ -204,6 +204,6 @@ def _sweep_jvp(count: int, primals: tuple, tangents: tuple) -> tuple:
     """A loop over the turns in use has no reverse mode; a loop over all turns, which does the same, has."""
 
     def sweep_all_turns(rows: tuple[Rows, ...], *others: Any) -> tuple[Array, tuple[Array, ...]]:
-        return sweeps.by_turns(count, lambda _: sweeps.of_law(), visiting_all_turns(rows), *others)
+        return _sweep.fun(count, visiting_all_turns(rows), *others)
 
     return jax.jvp(sweep_all_turns, primals, tangents)

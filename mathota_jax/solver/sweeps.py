@@ -59,25 +59,23 @@ def run(
     biases: tuple[Array, ...],
     velocity: Array,
     impulses: tuple[Array, ...],
-    apart: bool = True,
 ) -> tuple[Array, tuple[Array, ...]]:
     """A number of sweeps, for use inside of custom derivatives.
 
     Args:
       iterations: that number.
       rows: groups of rows, swept in this order.
-      update: of each sweep, from its number.
+      update: of each sweep, from its number. It looks at each column by itself.
       coefficients: what the update gets of each group, with a leading turn axis.
       biases, impulses: of each group (turn, row, column, world).
       velocity: (component, block, world) with those impulses.
-      apart: whether an update looks at each column by itself.
 
     Returns:
       The velocity and the impulses after the sweeps.
     """
     args = (rows, coefficients, biases, velocity, impulses)
     one_by_one = functools.partial(by_turns, iterations, update)
-    in_one_kernel = functools.partial(_in_one_kernel, iterations, update, apart)
+    in_one_kernel = functools.partial(_in_one_kernel, iterations, update)
     return by_platform(one_by_one, in_one_kernel, (velocity, impulses), *args)
 
 
@@ -102,7 +100,6 @@ def by_turns(
 def _in_one_kernel(
     iterations: int,
     update: Callable[[Array | int], Update],
-    apart: bool,
     rows: tuple[Rows, ...],
     coefficients: tuple[object, ...],
     biases: tuple[Array, ...],
@@ -118,7 +115,7 @@ def _in_one_kernel(
         return answer
 
     groups = tuple(
-        visited(group, (group.matrix, bias, coefficient), apart)
+        visited(group, (group.matrix, bias, coefficient))
         for group, bias, coefficient in zip(rows, biases, coefficients, strict=True)
     )
     return visits.run(iterations, [answer_of(group) for group in rows], groups, velocity, impulses)
