@@ -71,7 +71,7 @@ SCENES = {
 }
 
 
-DERIVATIVES = ("box", "balls by places", "boxes in soft steps")
+DERIVATIVES = ("box", "balls by places")
 
 
 def motion(name):
