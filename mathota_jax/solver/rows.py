@@ -206,8 +206,7 @@ def visited(group: Rows, values: Any) -> visits.Group:
     else:
         blocks, turns = group.places.blocks, group.places.turns
         turns = table.turn_count if turns is None else turns
-    count = jnp.asarray(turns * table.constraint_count)
-    return visits.Group(values, blocks, count, table.constraint_count, table.together)
+    return visits.Group(values, blocks, jnp.asarray(turns))
 
 
 def add_impulses(rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...]) -> Array:
@@ -289,9 +288,7 @@ def _add_at_filled_places(together: int, places: Places, matrix: Changes, veloci
         def answer(_: Array, __: list[Array], values: Changes, impulse: Array) -> tuple[list[Array], Array]:
             return values.changes(impulse, impulse.shape[1]), impulse
 
-        constraints = places.blocks[0].shape[1]
-        count = jnp.asarray(places.turns) * constraints
-        group = visits.Group(matrix, places.blocks, count, constraints, together)
+        group = visits.Group(matrix, places.blocks, jnp.asarray(places.turns))
         return visits.run(1, [answer], (group,), velocity, (impulse,))[0]
 
     return by_platform(by_turns, in_one_kernel, velocity, places, matrix, velocity, impulse)

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.spatial.lanes import Entries, entries, written_out
-from mathota_jax.struct import pytree, static
+from mathota_jax.struct import pytree
 
 LANES = 32
 """Worlds of one program of the kernel: few, so that with some thousands every multiprocessor has its share."""
@@ -40,16 +40,12 @@ class Group:
     Attributes:
       values: pytree of arrays (turn, ..., column or constraint or 1, world or 1).
       blocks: for each side, (turn, constraint, world or 1) velocity block; one that does not exist receives nothing.
-      visits: () number of constraints that are visited, the first ones.
-      constraints: number of constraints in a turn.
-      together: number of neighbouring columns that belong to one constraint, a power of 2.
+      turns: () number of turns that are visited, the first ones.
     """
 
     values: Any
     blocks: tuple[Array, ...]
-    visits: Array
-    constraints: int = static()
-    together: int = static()
+    turns: Array
 
 
 def run(
@@ -67,7 +63,7 @@ def run(
       answers: how the constraints of each group answer to a visit.
       groups: what is visited.
       velocity: (component, block, world).
-      impulses: of each group (turn, row, column, world).
+      impulses: of each group (turn, row, column, world); the columns of a constraint are neighbours, a power of 2.
       interpret: whether to run on any device, slowly, to test it.
 
     Returns:
@@ -81,7 +77,7 @@ def run(
 
     # Where kernels are interpreted, what is not to be stored is stored as it was.
     lane_count = velocity.shape[-1] if interpret else LANES
-    groups = tuple(dataclasses.replace(group, visits=jnp.reshape(group.visits, (1, 1))) for group in groups)
+    groups = tuple(dataclasses.replace(group, turns=jnp.reshape(group.turns, (1, 1))) for group in groups)
     worlds, state = velocity.shape[-1], (velocity, *impulses)
     leaves, tree = jax.tree.flatten((groups, state))
     fixed = len(leaves) - len(state)
@@ -103,7 +99,8 @@ def run(
         def one_round(number: Array, _: None) -> None:
             for answer, group, impulse in zip(answers, own, answered, strict=True):
                 visit = functools.partial(_visit, lanes, number, answer, group, moved, impulse)
-                lax.fori_loop(0, lanes.read(group.visits, 0), lambda k, _, visit=visit: visit(k), None)
+                visits = lanes.read(group.turns, 0) * group.blocks[0].shape[1]
+                lax.fori_loop(0, visits, lambda k, _, visit=visit: visit(k), None)
 
         lax.fori_loop(0, rounds, one_round, None)
 
@@ -124,7 +121,8 @@ def _visit(
     lanes: _Lanes, number: Array, answer: Answer, group: Any, moved: _Stored, answered: _Stored, place: Array
 ) -> None:
     """Lets one constraint answer, and stores what changes."""
-    constraints, together = np.int32(group.constraints), group.together
+    constraints = np.int32(group.blocks[0].shape[1])
+    together = answered.shape[2] // int(constraints)
     turn, constraint = lax.div(place, constraints), lax.rem(place, constraints)
     components, block_count, _ = moved.shape
     blocks = [lanes.read(side, turn * constraints + constraint) for side in group.blocks]

@@ -78,8 +78,11 @@ def _map_chunks(function: Callable[..., Any], constants: Any, chunks: Any, used:
 
     def at_once(constants: Any, chunks: Any, used: Array) -> Any:
         # A GPU waits longer for the end of a loop to be known than for the work on what is empty.
-        found = jax.vmap(lambda chunk: function(chunk, *constants))(chunks)
-        return jax.tree.map(lambda x: jnp.where(_leading(jnp.arange(len(x)) < used, x), x, jnp.zeros_like(x)), found)
+        def of_chunk(k: Array, chunk: Any) -> Any:
+            found = function(chunk, *constants)
+            return jax.tree.map(lambda x: jnp.where(k < used, x, jnp.zeros_like(x)), found)
+
+        return jax.vmap(of_chunk)(jnp.arange(count), chunks)
 
     count, chunk = len(jax.tree.leaves(chunks)[0]), jax.tree.map(lambda x: x[0], chunks)
     shapes = _shapes(function, constants, chunk, count)
@@ -110,11 +113,6 @@ def _shapes(function: Callable[..., Any], constants: Any, chunk: Any, *count: in
 
 def _zeros(shapes: Any) -> Any:
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-
-def _leading(values: Array, like: Array) -> Array:
-    """Values (row,) as (row, 1, ...), with as many axes as `like`."""
-    return values.reshape(-1, *(1,) * (like.ndim - 1))
 
 
 def _chunk_count(count: int) -> int:

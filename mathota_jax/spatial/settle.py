@@ -198,10 +198,7 @@ def _transpose_materialize(cotangents: Sequence[Any], *arrays: Any) -> list[Any]
 
 def _batch_materialize(arrays: Sequence[Array], axes: Sequence[int | None]) -> tuple[list[Array], list[int]]:
     size = next(array.shape[axis] for array, axis in zip(arrays, axes, strict=True) if axis is not None)
-    moved = [
-        jnp.broadcast_to(array, (size, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
-        for array, axis in zip(arrays, axes, strict=True)
-    ]
+    moved = [batching.bdim_at_front(array, axis, size) for array, axis in zip(arrays, axes, strict=True)]
     return _materialize_p.bind(*moved), [0] * len(moved)
 
 
