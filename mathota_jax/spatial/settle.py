@@ -62,9 +62,9 @@ def store(value: Array, source: Array) -> Array:
 
     Args:
         value: Floating-point array.
-        source: Finite array of the same shape from which CPUs make a divisor. It may be `value` itself, unless `value`
-            has to stay linear in something. (XLA turns a division by a broadcast scalar into a product, which it copies;
-            so the divisor needs the full shape.)
+        source: Array of the same shape from which CPUs make a divisor. It may be `value` itself, unless `value` has to
+            stay linear in something. (XLA turns a division by a broadcast scalar into a product, which it copies; so the
+            divisor needs the full shape.)
     """
     if not jnp.issubdtype(value.dtype, jnp.floating):
         raise TypeError(f"store: the array must be of floating point, got {value.dtype}")
@@ -73,8 +73,12 @@ def store(value: Array, source: Array) -> Array:
 
 
 def _store_by_division(value: Array, source: Array) -> Array:
-    """The divisor is 1 for every finite number, but XLA does not know that: a float times 0 need not be 0."""
-    return value / (source * 0 + 1)
+    """The divisor is 1 whatever the bits of the source: XLA does not see that, LLVM does, and leaves the division out.
+
+    A divisor that LLVM keeps was measured to cost 5 to 10 % of a step.
+    """
+    bits = lax.bitcast_convert_type(source, f"int{8 * source.dtype.itemsize}")
+    return value / ((bits | 1) & 1).astype(value.dtype)
 
 
 def _jvp_store(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Any]:

@@ -61,6 +61,12 @@ def test_what_is_stored_keeps_its_type():
         store(values[1], values[1])
 
 
+def test_any_number_is_stored_as_it_is(precision):
+    odd = jnp.array([0.0, -0.0, 1.5, jnp.inf, -jnp.inf, jnp.nan, 1e-45, 3e38], precision)
+    found = jax.jit(lambda x: store(x, x))(odd)
+    assert np.asarray(found).tobytes() == np.asarray(odd).tobytes()
+
+
 def test_on_gpus_barriers_hold_what_divisions_do_not():
     """XLA copies divisions there, and has no barriers any more when it fuses for CPUs: seen in the programs of both."""
 
