@@ -15,6 +15,7 @@ from jax import Array
 
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
+from mathota_jax.spatial.settle import store
 from mathota_jax.struct import pytree
 
 
@@ -133,7 +134,7 @@ class Cone:
     def hold(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> list[Array]:
         """New impulses of the tangents for one of the normal row."""
         free_1, free_2 = (part - error * self.tangent_mass for part, error in zip(old, errors, strict=True))
-        scale = self._share(normal, free_1, free_2)
+        scale = store(self._share(normal, free_1, free_2), normal)  # both tangents read it
         return [free_1 * scale, free_2 * scale]
 
     def _share(self, normal: Array, free_1: Array, free_2: Array) -> Array:

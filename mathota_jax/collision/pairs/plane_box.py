@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mathota_jax.collision.closest import round_point
 from mathota_jax.collision.manifold import Manifold
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.settle import settle_code
+from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import dot, where
 
 
@@ -29,7 +29,8 @@ def plane_box(plane: dict[str, Any], _: Pose, box: dict[str, Any], pose: Pose) -
     second = where(is_x, z, where(is_y, x, y))
     first_bit, second_bit = jnp.where(is_x, 2, jnp.where(is_y, 4, 1)), jnp.where(is_x, 4, jnp.where(is_y, 1, 2))
     base = positive << axis
-    center = pose.position + outward
+    # Each of the four points reads them.
+    center, first, second = compute_once((pose.position + outward, first, second), pose.position.x)
     points = []
     for sign_1, sign_2 in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
         corner = center + first * float(sign_1) + second * float(sign_2)
