@@ -43,7 +43,7 @@ class Dense:
         return self.response[0][..., 0, :, :]
 
     def rates(self, velocities: Sequence[Array]) -> Array:
-        """``J v``: (..., row, column, world) from the velocities (..., component, column, world) of each side."""
+        """``J v``: (..., row, column, world) from the velocities (..., component, constraint, world) of each side."""
         return functools.reduce(
             jnp.add, [_along(side, velocity) for side, velocity in zip(self.jacobian, velocities, strict=True)]
         )
@@ -316,12 +316,25 @@ def _others(rows: Array) -> Array:
 
 
 def _along(rows: Array, velocity: Array) -> Array:
-    return add_slices(rows * spread(velocity[..., None, :, :, :], rows.shape), -3)
+    """(..., row, column, world) from (..., row, component, column, world) and (..., component, constraint, world)."""
+    found = _by_constraint(rows, velocity.shape[-2])
+    total = add_slices(found * spread(velocity[..., None, :, :, None, :], found.shape), -4)
+    return total.reshape(*rows.shape[:-3], rows.shape[-2], total.shape[-1])
 
 
 def _sum(rows: Array, impulse: Array, together: int) -> Array:
     """(component, constraint, world) sum of (row, component, column, world) times the impulses (row, column, world)."""
-    return sum_over_points(add_slices(rows * spread(impulse[..., None, :, :], rows.shape), -4), together)
+    constraints = rows.shape[-2] // together
+    found, pushed = _by_constraint(rows, constraints), _by_constraint(impulse, constraints)
+    return add_slices(add_slices(found * spread(pushed[..., None, :, :, :], found.shape), -5), -2)
+
+
+def _by_constraint(values: Array, constraints: int) -> Array:
+    """(..., constraint, column of it, world) from (..., column, world).
+
+    Products are taken in this shape: where a kernel has to find the constraint of a column, it is not vectorised.
+    """
+    return values.reshape(*values.shape[:-2], constraints, -1, values.shape[-1])
 
 
 def sum_over_points(values: Array, together: int) -> Array:

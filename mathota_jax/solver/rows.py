@@ -98,20 +98,17 @@ class Rows:
 
 
 def gather(velocity: Array, blocks: Any, together: int = 1) -> Array:
-    """Velocities (component, column, world) of the blocks of a turn; padding reads any block (it has no impulse)."""
+    """Velocities (component, constraint, world) of the blocks of a turn; padding reads any block (it has no impulse)."""
     last = velocity.shape[1] - 1
     if isinstance(blocks, jax.Array) and blocks.ndim == 2:
         if velocity.shape[1] <= MASKED_BLOCKS:
             parts = [jnp.where(blocks == k, part[:, None], 0.0) for k, part in enumerate(unstack(velocity, 1))]
-            chosen = _store_of_blocks(functools.reduce(jnp.add, parts), blocks)
-        else:
-            index = jnp.minimum(blocks, last)[None]
-            chosen = jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds")
-    elif isinstance(blocks, tuple):
-        chosen = take(velocity, [min(block, last) for block in blocks[::together]], axis=1)
-    else:
-        chosen = jnp.take(velocity, blocks[::together], axis=1, mode="clip")
-    return chosen if chosen.shape[1] == 1 else jnp.repeat(chosen, together, axis=1)  # one block broadcasts
+            return _store_of_blocks(functools.reduce(jnp.add, parts), blocks)
+        index = jnp.minimum(blocks, last)[None]
+        return jnp.take_along_axis(velocity, index, axis=1, mode="promise_in_bounds")
+    if isinstance(blocks, tuple):
+        return take(velocity, [min(block, last) for block in blocks[::together]], axis=1)
+    return jnp.take(velocity, blocks[::together], axis=1, mode="clip")
 
 
 def _store_of_blocks(values: Array, blocks: Array) -> Array:
@@ -183,7 +180,7 @@ def matrix_velocity(table: Table | TracedTable, matrix: RowMatrix, places: Place
         assert places is not None
         gathered = [jax.vmap(lambda b: gather(velocity, b, table.together))(blocks) for blocks in places.blocks]
     else:
-        gathered = [_all_turns(velocity, blocks) for blocks in table.blocks]
+        gathered = [_all_turns(velocity, blocks, table.together) for blocks in table.blocks]
     return matrix.rates(gathered)
 
 
@@ -308,8 +305,8 @@ def _add_at_filled_places_jvp(together: int, primals: tuple, tangents: tuple) ->
     return _add_at_filled_places(together, *primals), lax.scan(body, d_velocity, scanned)[0]
 
 
-def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...]) -> Array:
-    """(turn, component, column, world) velocities of all blocks of a table side."""
-    flat = [min(block, velocity.shape[1] - 1) for turn in blocks for block in turn]
+def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...], together: int) -> Array:
+    """(turn, component, constraint, world) velocities of all blocks of a table side."""
+    flat = [min(block, velocity.shape[1] - 1) for turn in blocks for block in turn[::together]]
     gathered = spread(take(velocity, flat, axis=1), (velocity.shape[0], len(flat), velocity.shape[2]))
     return jnp.moveaxis(gathered.reshape(velocity.shape[0], len(blocks), -1, velocity.shape[2]), 1, 0)

@@ -200,10 +200,7 @@ def _answer(law: Law, update: Update, together: int, moving: list[Array], values
         first, others = matrix.first_row(), matrix.other_rows()
         normal = store(update.first(coefficients, bias, impulse, bias[:1] + first.rates(moving)), first.like)
         pushed = first.changes_once(normal - impulse[:1], together)
-        moving = [
-            old + (part if part.shape[1] == 1 else jnp.repeat(part, together, axis=1))
-            for old, part in zip(moving, pushed, strict=True)
-        ]
+        moving = [store(old + part, old) for old, part in zip(moving, pushed, strict=True)]
         error = store(bias[1:] + others.rates(moving), others.like)
         held = store(update.others(coefficients, bias, impulse, normal, error), others.like)
         changes = [a + b for a, b in zip(pushed, others.changes(held - impulse[1:], together), strict=True)]
