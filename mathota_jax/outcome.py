@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.settle import compute_once
+from mathota_jax.spatial.spread import add_all_slices, add_slices
 from mathota_jax.state import EndForces, Flag, State
 
 
@@ -37,8 +39,7 @@ def new_state(scene: Scene, state: State, moved: Bodies, kept: dict[str, Array],
         place(scene, getattr(state, name), getattr(moved, name))
         for name in ("position", "orientation", "velocity", "angular_velocity")
     )
-    finite = [jnp.isfinite(value).all((0, 1)) for value in (position, orientation, velocity, angular_velocity)]
-    broken = jnp.where(finite[0] & finite[1] & finite[2] & finite[3], 0, int(Flag.NON_FINITE))
+    broken = jnp.where(_finite((position, orientation, velocity, angular_velocity)), 0, int(Flag.NON_FINITE))
     if failed is not None:
         broken = broken | jnp.where(failed > 0, int(Flag.SOLVER_NOT_CONVERGED), 0)
     changes: dict[str, Any] = {
@@ -53,6 +54,14 @@ def new_state(scene: Scene, state: State, moved: Bodies, kept: dict[str, Array],
     if "flags" in kept:
         kept = {**kept, "flags": changes["flags"] | kept["flags"].astype(state.flags.dtype)}
     return dataclasses.replace(state, **{**changes, **kept})
+
+
+def _finite(values: Sequence[Array]) -> Array:
+    """(world,) whether all (body, component, world) are finite.
+
+    Zero times anything else is NaN, and a sum of slices runs side by side for all worlds; a reduction does not.
+    """
+    return jnp.isfinite(add_all_slices(functools.reduce(jnp.add, [add_slices(value * 0.0, 1) for value in values])))
 
 
 def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[str, Array]:

@@ -136,6 +136,7 @@ def sliding_step(
     """
     jacobian, response = entries
     own, *coupling = (_response(jacobian, response, 0, column) for column in range(3))
+    slip = compute_once(slip, meets)  # else all is in one kernel, which is not vectorised
     pull = [-part * law.tangent_mass for part in (slip[:, 0], slip[:, 1])]
     size = safe_sqrt(pull[0] * pull[0] + pull[1] * pull[1])
     along = law.friction * safe_divide(pull[0] * coupling[0] + pull[1] * coupling[1], size)
