@@ -27,6 +27,7 @@ from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import gather, take
+from mathota_jax.spatial.running_sum import running_sum
 from mathota_jax.spatial.vector import Vec3, norm
 
 NO_PAIR = -1
@@ -223,7 +224,7 @@ def _turns(scene: Scene, found: PairList, turn_counts: list[int]) -> tuple[Array
     sorted_pairs = jnp.sort(code * capacity + jnp.arange(capacity, dtype=jnp.int32)[:, None], axis=0) % capacity
     counts = jnp.zeros((len(turn_counts) * (turn_count + 1), worlds), jnp.int32)
     counts = counts.at[code, jnp.arange(worlds)].add(1, mode="drop")
-    return sorted_pairs, counts, jnp.cumsum(counts, axis=0) - counts
+    return sorted_pairs, counts, running_sum(counts) - counts
 
 
 def _in_list_order(scene: Scene) -> bool:
@@ -244,7 +245,7 @@ def _ranks(group_of_pair: Array | int, active: Array, group_count: int) -> Array
     rank = jnp.zeros(active.shape, jnp.int32)
     for group in range(group_count):
         mine = active & (group_of_pair == group)
-        rank = jnp.where(mine, jnp.cumsum(mine.astype(jnp.int32), axis=0) - 1, rank)
+        rank = jnp.where(mine, running_sum(mine.astype(jnp.int32)) - 1, rank)
     return rank
 
 

@@ -42,16 +42,16 @@ def compute_once(values: Any, like: Array) -> Any:
     chain of n dependent rows costs 2^n. Values and derivatives are unchanged.
 
     Args:
-        values: Pytree of finite arrays; integers must be exact in the type of `like`.
-        like: Floating-point array whose last axis is that of the worlds. A value that all worlds share is left alone:
-            storing it would cost a kernel, while computing it again costs nothing beside what is done for each world.
+        values: Pytree of arrays.
+        like: Array whose last axis is that of the worlds. A value that all worlds share is left alone: storing it would
+            cost a kernel, while computing it again costs nothing beside what is done for each world.
     """
     worlds = like.shape[-1]
 
     def once(value: Array | float) -> Array | float:
         if not isinstance(value, Array) or (worlds > 1 and value.shape[-1:] in ((), (1,))):
             return value
-        number = value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(like.dtype)
+        number = value.astype(jnp.int32) if value.dtype == bool else value
         return store(number, number).astype(value.dtype)
 
     return jax.tree.map(once, values)
@@ -61,13 +61,13 @@ def store(value: Array, source: Array) -> Array:
     """Returns `value` unchanged, computed exactly once, and so are its tangents and cotangents.
 
     Args:
-        value: Floating-point array.
+        value: Array of numbers.
         source: Array of the same shape from which CPUs make a divisor. It may be `value` itself, unless `value` has to
             stay linear in something. (XLA turns a division by a broadcast scalar into a product, which it copies; so the
             divisor needs the full shape.)
     """
-    if not jnp.issubdtype(value.dtype, jnp.floating):
-        raise TypeError(f"store: the array must be of floating point, got {value.dtype}")
+    if value.dtype == bool:
+        raise TypeError("store: the array must be of numbers, got bool")
     value, source = jnp.broadcast_arrays(value, lax.stop_gradient(source))
     return _store_p.bind(value, source.astype(value.dtype))
 
@@ -78,7 +78,7 @@ def _store_by_division(value: Array, source: Array) -> Array:
     A divisor that LLVM keeps was measured to cost 5 to 10 % of a step.
     """
     bits = lax.bitcast_convert_type(source, f"int{8 * source.dtype.itemsize}")
-    return value / ((bits | 1) & 1).astype(value.dtype)
+    return lax.div(value, ((bits | 1) & 1).astype(value.dtype))
 
 
 def _jvp_store(primals: Sequence[Array], tangents: Sequence[Any]) -> tuple[Array, Any]:

@@ -9,6 +9,7 @@ from jax.test_util import check_grads
 from mathota_jax.bodies import Inertia
 from mathota_jax.dynamics.free_motion import PARTS, rotate_at_constant_momentum
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
+from mathota_jax.spatial.running_sum import running_sum
 from mathota_jax.spatial.settle import compute_once, materialize, settle, store, store_cotangents
 from mathota_jax.spatial.vector import Vec3
 
@@ -57,8 +58,22 @@ def test_what_is_stored_keeps_its_type():
     for value, found in zip(values, jax.jit(lambda v: compute_once(v, like))(values), strict=True):
         assert found.dtype == value.dtype
         np.testing.assert_array_equal(found, value)
-    with pytest.raises(TypeError, match="floating point, got int32"):
-        store(values[1], values[1])
+    with pytest.raises(TypeError, match="of numbers, got bool"):
+        store(values[2], values[2])
+
+
+def test_integers_are_stored_as_they_are():
+    odd = jnp.array([0, 1, -1, 2**31 - 1, -(2**31), 2**24 + 1])
+    np.testing.assert_array_equal(jax.jit(lambda x: store(x, x))(odd), odd)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 45, 351])
+def test_running_sums(count):
+    """Also beyond what float32 counts exactly."""
+    entries = np.random.default_rng(0).integers(-3, 2**22, (count, 5)).astype(np.int32)
+    found = jax.jit(running_sum)(entries)
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found, np.cumsum(entries, axis=0, dtype=np.int32))
 
 
 def test_any_number_is_stored_as_it_is(precision):

@@ -15,6 +15,7 @@ from jax import Array
 from mathota_jax.collision.broadphase.volumes import Bounds, overlaps, plane_overlaps
 from mathota_jax.pair_filter import NOTHING_IGNORED, Filter
 from mathota_jax.spatial.indexing import take
+from mathota_jax.spatial.running_sum import running_sum
 from mathota_jax.spatial.settle import settle, store
 
 LARGEST_SHAPE_COUNT = 46_340
@@ -153,7 +154,7 @@ def collect(
             hit, key, depth = hits(first, second, kept, known)
             shallowness = _shallowness(depth)
             listed = hit & ((shallowness < limit[0]) | ((shallowness == limit[0]) & (key <= limit[1])))
-            place = found + jnp.cumsum(listed.astype(jnp.int32), axis=0) - 1
+            place = found + running_sum(listed.astype(jnp.int32)) - 1
             place = jnp.where(listed, place, capacity)
             keys = keys.at[place, jnp.arange(worlds)].set(jnp.broadcast_to(key, place.shape), mode="drop")
             found = found + listed.sum(0, dtype=jnp.int32)
@@ -247,7 +248,7 @@ def _deepest(enumerators: Sequence[Enumerate], hits: Callable, capacity: int, wo
         histogram = (jnp.zeros((bin_count, worlds), jnp.int32),)
         for enumerate_pairs in enumerators:
             histogram = enumerate_pairs(visit, histogram)
-        counts = jnp.cumsum(histogram[0], axis=0)
+        counts = running_sum(histogram[0])
         # The digit in which the last place falls; what has a smaller digit is kept whole. The last digit if all fit.
         digit = jnp.minimum((counts < room).sum(0, dtype=jnp.int32), bin_count - 1)
         before = jnp.where(jnp.arange(bin_count)[:, None] < digit, histogram[0], 0).sum(0, dtype=jnp.int32)

@@ -8,6 +8,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.broadphase.pair_list import Enumerate, Visit
 from mathota_jax.spatial.indexing import gather
+from mathota_jax.spatial.running_sum import running_sum
 
 SMALLEST_CHUNK = 256
 
@@ -45,7 +46,7 @@ def range_pairs(order: Array, owner: Array, start: Array, count: Array) -> Enume
       start, count: (range, world) the range; a count of 0 or less is none.
     """
     count = jnp.maximum(count, 0)
-    ends = jnp.cumsum(count, axis=0)
+    ends = running_sum(count)
     begins = ends - count
     total = ends[-1]
     range_count, worlds = count.shape
