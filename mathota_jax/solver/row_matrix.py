@@ -39,7 +39,7 @@ class Dense:
 
     @property
     def like(self) -> Array:
-        """A finite array (..., row, column, world)."""
+        """Some array (..., row, column, world), for `store`."""
         return self.response[0][..., 0, :, :]
 
     def rates(self, velocities: Sequence[Array]) -> Array:
@@ -112,7 +112,7 @@ class Points:
 
     @property
     def like(self) -> Array:
-        """A finite array (..., row, column, world)."""
+        """Some array (..., row, column, world), for `store`."""
         return self.packed[..., 0, :, :]
 
     @property
@@ -224,7 +224,7 @@ class Picked:
 
     @property
     def like(self) -> Array:
-        """A finite array (..., row, column, world)."""
+        """Some array (..., row, column, world), for `store`."""
         return self.response[..., 0, :, :]
 
     def rates(self, velocities: Sequence[Array]) -> Array:
@@ -268,7 +268,7 @@ class FirstRow:
 
     @property
     def like(self) -> Array:
-        """A finite array (..., row, column, world)."""
+        """Some array (..., row, column, world), for `store`."""
         return self.whole.first_row().like
 
     def rates(self, velocities: Sequence[Array]) -> Array:

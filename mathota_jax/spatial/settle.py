@@ -22,7 +22,7 @@ from jax.interpreters import ad, batching, mlir
 
 
 def settle(decision: Array) -> Array:
-    """Returns the finite number `decision` unchanged, computed exactly once. Elementwise, floating point, any shape.
+    """Returns the number `decision` unchanged, computed exactly once. Elementwise, floating point, any shape.
 
     The derivative is zero: a decision is discrete.
     """
