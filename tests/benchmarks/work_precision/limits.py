@@ -1,10 +1,10 @@
 """What limits the scenes whose targets are not met, and what was tried. Shown in the report beside the missing factor."""
 
 LIMITS = {
-    "stack10": "the machine on the day: it gave MuJoCo 0.74 of its rate of 23 November, when 111 k/s were measured here, and the "
-    "ratio to MuJoCo is the same. A step is some 2700 kernels of 50 ns to launch (9 %), and 128 worlds pass 7 MB through a cache "
-    "of 1 MB: 96 worlds are 5 % faster, 32 a quarter slower. What is stored without a division, and products taken constraint "
-    "by constraint, gained 18 % since",
+    "stack10": "the machine on the day: it gave MuJoCo 0.74 of its rate of 23 November, when 111 k/s were measured here; "
+    "the ratio to MuJoCo is the same. A step is some 2700 kernels of 50 ns to launch (9 %), and 128 worlds pass 7 MB "
+    "through a cache of 1 MB: 96 worlds are 5 % faster, 32 a quarter slower. What is stored without a division, and "
+    "products taken constraint by constraint, gained 18 % since",
     "hulls8": "eight or nine pairs of 28 are close, three overlap. In 128 worlds search and clipping are 65 % of a step, in "
     "some 1600 kernels of one to four microseconds: 15 iterations of GJK of some 40 kernels each, the exact axes (12 %), "
     "faces and their clipping (15 %). Sweeps over them one after the other take 6 %. Reductions over 3 to 12 rows without "
