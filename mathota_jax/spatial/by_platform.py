@@ -18,7 +18,8 @@ GPU = "cuda"
 def by_platform(anywhere: Callable[..., Any], on_gpu: Callable[..., Any], result: Any, *args: Any) -> Any:
     """`anywhere(*args)`, or `on_gpu(*args)` in programs for GPUs.
 
-    Only the one that is compiled is traced, when that is known. Not differentiable: for use inside of custom derivatives.
+    Only the one that is compiled is traced, when that is known. Not differentiable: for integers, and for use inside of
+    custom derivatives.
 
     Args:
       anywhere: function of pytrees that closes over no traced array.

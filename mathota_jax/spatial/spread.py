@@ -75,7 +75,7 @@ def diagonal(matrix: Array) -> Array:
 
 
 def add_all_slices(array: Array) -> Array:
-    """Sum (world,) of finite numbers, each computed once, along all axes but the last."""
+    """Sum (world,) of numbers, each computed once, along all axes but the last."""
     array = store(array, array)
     if array.size <= FEW_SLICES * array.shape[-1]:
         return add_slices(array.reshape(-1, array.shape[-1]), 0)
