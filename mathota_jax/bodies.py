@@ -200,6 +200,12 @@ def unpack_blocks(velocity: Array) -> tuple[Vec3, Vec3 | None]:
     return Vec3(*components[:3]), Vec3(*components[3:]) if len(components) == 6 else None
 
 
+def momentum(inertia: Inertia, velocity: Array) -> Array:
+    """Of the blocks of a velocity (component, block, world), likewise."""
+    linear, angular = unpack_blocks(velocity)
+    return pack_blocks(linear * (1.0 / inertia.inverse_mass), None if angular is None else inertia.apply(angular))
+
+
 def respond_alone(inertia: Inertia, impulse: Array) -> Array:
     """Velocities (component, block, ..., world) that impulses on bodies, likewise, give to each by itself."""
     linear, angular = unpack_blocks(impulse)

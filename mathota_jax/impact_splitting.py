@@ -96,7 +96,7 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     start = start[:joint_count] + tuple(
         jnp.where(none, 0.0, impulse) for impulse, none in zip(start[joint_count:], dropped, strict=True)
     )
-    solved, impulses, failed, *_ = solve_rows(scene, problem, packed, start)
+    solved, impulses, failed, *_ = solve_rows(scene, problem, inertia, packed, start)
     lever, beyond = levers(scene, left, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(blocks, inertia, inertia, None, free, torque, decay, solved, lever, left, beyond)
     path = flight(blocks, inertia, free, torque, decay, solved, left)

@@ -70,6 +70,11 @@ class Options:
         ``load / (2 effective mass * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`,
         `baumgarte` and `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its
         restitution pass. All figures: docs/solvers.md.
+      conjugate: take the sweeps of "pgs" along conjugate directions where bodies lie on one another: for tall stacks and
+        large mass ratios. At 60 Hz with ten sweeps in float32 a cube of 100 times the mass rests on a cube to 4e-6 of its
+        size, of 1000 times the mass it dips by 4 % (sweeps alone let both fall through), and forty cubes stand, dipping by
+        0.1 %. Ten such sweeps take a step 1.3 times as long. Worlds in which a contact slides are solved by sweeps alone;
+        absent in scenes that bounce, and where joints are solved beside the contacts.
       exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the end of
         the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot stands on feet
         of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a broadphase or of many
@@ -122,6 +127,7 @@ class Options:
     touching_capacity: int | None = None
     gradient_iterations: int | None = None
     solver: str = "pgs"
+    conjugate: bool = False
     exact_joints: bool = True
     substeps: int | None = None
     continuous: bool = False
@@ -156,13 +162,15 @@ class Options:
             value = getattr(self, name)
             if not (_is_number(value) and value > 0):
                 raise ValueError(f"Options.{name} must be a positive finite number, got {value!r}")
-        for name in ("warm_start", "exact_joints", "continuous", "sleep"):
+        for name in ("warm_start", "conjugate", "exact_joints", "continuous", "sleep"):
             value = getattr(self, name)
             if not isinstance(value, bool):
                 raise ValueError(f"Options.{name} must be True or False, got {value!r}")
         if self.solver not in SOLVER_CHOICES:
             known = ", ".join(repr(choice) for choice in SOLVER_CHOICES)
             raise ValueError(f"Options.solver must be one of {known}, got {self.solver!r}")
+        if self.conjugate and self.solver != "pgs":
+            raise ValueError(f"Options.conjugate needs solver='pgs', of whose sweeps it is; got solver={self.solver!r}")
         if self.substeps is not None and self.solver != "soft_step":
             raise ValueError(
                 f"Options.substeps = {self.substeps} needs solver='soft_step', got solver={self.solver!r}; "

@@ -10,7 +10,17 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.bodies import Bodies, Inertia, merge, moving, moving_inertia, of_all_bodies, unpack_blocks, vector
+from mathota_jax.bodies import (
+    Bodies,
+    Inertia,
+    merge,
+    momentum,
+    moving,
+    moving_inertia,
+    of_all_bodies,
+    unpack_blocks,
+    vector,
+)
 from mathota_jax.constraints import (
     contact,
     graph,
@@ -109,6 +119,7 @@ class SolvedRows(NamedTuple):
 def solve_rows(
     scene: Scene,
     problem: Problem,
+    inertia: Inertia,
     velocity: Array,
     start: tuple[Array, ...],
     change: Array | None = None,
@@ -120,6 +131,7 @@ def solve_rows(
     Args:
       scene: static scene.
       problem: the constraints.
+      inertia: with which the bodies respond.
       velocity: (component, block, world) without them.
       start: impulses to start from.
       change: what these do to the velocity, where that is known.
@@ -136,7 +148,7 @@ def solve_rows(
         return SolvedRows(solved, impulses, held=held)
     if scene.rebounds_may_gain:
         start = in_every_world(start, worlds)
-    begin = _Begin(velocity, _held(scene, problem, velocity, start), start, change)
+    begin = _Begin(velocity, _held(scene, problem, velocity, start), start, change, inertia)
     solved, impulses, failed = _solve_all(scene, problem, begin, known)
     if not scene.rebounds_may_gain:
         return SolvedRows(solved, impulses, failed)
@@ -156,12 +168,14 @@ class _Begin(NamedTuple):
       with_joints: the same where mechanisms hold, if anything asks for it.
       impulses: of all groups.
       change: what these do to the velocity, where that is known.
+      inertia: with which the bodies respond.
     """
 
     velocity: Array
     with_joints: Array
     impulses: tuple[Array, ...]
     change: Array | None
+    inertia: Inertia
 
 
 def _held(scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...]) -> Array:
@@ -176,7 +190,7 @@ def _solve_all(
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """`solve_rows` where there are other rows than those of mechanisms."""
     if problem.held is None:
-        return _sweep(scene, problem.rows, begin.velocity, begin.impulses, known, begin.change)
+        return _sweep(scene, problem.rows, begin.velocity, begin.impulses, known, begin.change, begin.inertia)
     if problem.reduced is not None:
         return *_solve_reduced(scene, problem, problem.reduced, problem.held, begin), None
     return _solve_mechanisms(scene, problem, problem.held, begin.velocity, begin.impulses)
@@ -242,13 +256,17 @@ def _sweep(
     start: tuple[Array, ...],
     known: bool,
     change: Array | None = None,
+    inertia: Inertia | None = None,
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """All rows by the solver of the scene."""
     if scene.options.solver == "converged":
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
     sweeps = 0 if known else iterations
-    return *pgs.solve(sweeps, _gradient_iterations(scene, rows, iterations), rows, velocity, start, change), None
+    gradient = _gradient_iterations(scene, rows, iterations)
+    conjugate = scene.options.conjugate and not scene.restitution and inertia is not None
+    masses = lax.stop_gradient(jax.tree_util.Partial(momentum, inertia)) if conjugate else None
+    return *pgs.solve(sweeps, gradient, rows, velocity, start, change, masses), None
 
 
 def _gradient_iterations(scene: Scene, rows: tuple[Rows, ...], iterations: int) -> int:

@@ -194,7 +194,9 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
         solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
     else:
         is_solved = known is not None or uncut is not None
-        solved, impulses, failed, held, uncut = solve_rows(scene, problem, packed, start, change, is_solved, held)
+        solved, impulses, failed, held, uncut = solve_rows(
+            scene, problem, acting, packed, start, change, is_solved, held
+        )
         lever, beyond = levers(scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(
         blocks, inertia, acting, halfway, free, torque, decay, solved, lever, model.dt, beyond, gained

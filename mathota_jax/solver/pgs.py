@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.solver import linear_sweeps, sweeps
+from mathota_jax.solver import conjugate, linear_sweeps, sweeps
+from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.rows import (
     Rows,
     add_changes,
@@ -48,6 +50,7 @@ def solve(
     velocity: Array,
     impulses: tuple[Array, ...],
     change: Array | None = None,
+    momentum: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, tuple[Array, ...]]:
     """Runs a fixed number of sweeps.
 
@@ -58,6 +61,8 @@ def solve(
       velocity: (component, block, world) without any constraint impulse.
       impulses: for each group (turn, row, column, world), the impulses to start from.
       change: (component, block, world) what they make of the velocity, without derivative; None if it is not known yet.
+      momentum: pytree function, of a change of the velocity (component, block, world) that of the momentum, for sweeps
+        along conjugate directions; None for sweeps alone.
 
     Returns:
       The velocity with the impulses, and the impulses.
@@ -68,23 +73,44 @@ def solve(
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law.starting(impulse) for group, impulse in zip(rows, impulses, strict=True))
 
-    def update(number: Array | int) -> Update:
-        def relaxed(law: Any, bias: Array) -> Any:
-            # A contact that bounces is alone for the most part, and its exact step ends at once. Longer ones leave an error
-            # of 1e-4, by which elastic boxes that bounce on their faces were measured to begin to spin.
-            longer = (number < iterations - PLAIN_SWEEPS) & (bias[0] >= 0)
-            return law.relaxed(jnp.where(longer, OVER_RELAXATION, 1.0).astype(bias.dtype))
+    def longer(number: Array | int) -> Array:
+        """Factor on the normal steps of a sweep."""
+        return jnp.where(number < iterations - PLAIN_SWEEPS, OVER_RELAXATION, 1.0).astype(velocity.dtype)
 
-        return sweeps.of_law(relaxed)
+    def relaxed(law: Any, bias: Array, factor: Array) -> Any:
+        # A contact that bounces is alone for the most part, and its exact step ends at once. Longer ones leave an error
+        # of 1e-4, by which elastic boxes that bounce on their faces were measured to begin to spin.
+        return law.relaxed(jnp.where(bias[0] >= 0, factor, 1.0).astype(bias.dtype))
 
-    return sweeps.run(iterations, rows, update, laws, biases, velocity, impulses)
+    if momentum is None or iterations == 1 or not _couple(rows):
+
+        def of_number(number: Array | int) -> Update:
+            return sweeps.of_law(lambda law, bias: relaxed(law, bias, longer(number)))
+
+        return sweeps.run(iterations, rows, of_number, laws, biases, velocity, impulses)
+
+    def with_factor(number: Array, slides: Array) -> tuple[Any, ...]:
+        factor = jnp.where(slides > 0, longer(number), 1.0).astype(velocity.dtype)
+        return tuple(
+            (law, jnp.broadcast_to(factor, (group.bias.shape[0], 1, *factor.shape)))
+            for law, group in zip(laws, rows, strict=True)
+        )
+
+    update = sweeps.of_law(lambda given, bias: relaxed(given[0], bias, given[1]), lambda given: given[0])
+    return conjugate.run(iterations, update, with_factor, momentum, rows, biases, velocity, impulses)
+
+
+def _couple(rows: tuple[Rows, ...]) -> bool:
+    """Whether impulses of contacts travel from block to block; on one block alone sweeps get far enough."""
+    sides = [group.table.blocks if group.places is None else group.places.blocks for group in rows]
+    return any(len(of_group) > 1 for of_group in sides) and all(isinstance(group.law, Cone | Push) for group in rows)
 
 
 @solve.defjvp
 def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangents: tuple) -> tuple:
-    rows, velocity, impulses, change = primals
-    d_rows, d_velocity, _, _ = tangents
-    velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses, change)
+    rows, velocity, impulses, change, momentum = primals
+    d_rows, d_velocity, _, _, _ = tangents
+    velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses, change, momentum)
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
     rows, d_rows = _dense(rows, d_rows)

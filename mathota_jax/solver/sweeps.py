@@ -19,7 +19,7 @@ from jax import Array, lax
 
 from mathota_jax.solver import visits
 from mathota_jax.solver.laws import Cone, Law
-from mathota_jax.solver.row_matrix import RowMatrix
+from mathota_jax.solver.row_matrix import sum_over_points
 from mathota_jax.solver.rows import UNROLLED_TURNS, Rows, gather, receive, visited
 from mathota_jax.solver.table import Table, TracedTable
 from mathota_jax.spatial import counter
@@ -35,19 +35,29 @@ class Update(NamedTuple):
       first: of the normals of contacts with friction, from coefficients and biases, the impulses of all their rows, and the
         errors of the normals.
       others: of their tangents, likewise, from the new impulses of the normals and the errors that these leave, too.
+      begin: impulses to start from, and what is to be remembered until then, from coefficients and what is held of the turn.
+      end: what is held from then on, and what is added up over all turns (sum, column, world), from coefficients, biases,
+        what was to be remembered, and the impulses before and after. Those sums are components of the velocity behind those
+        of which the matrix knows; None for none.
+      sums: their number.
     """
 
     at_once: Callable[[Any, Array, Array, Array], Array]
     first: Callable[[Any, Array, Array, Array], Array]
     others: Callable[[Any, Array, Array, Array, Array], Array]
+    begin: Callable[[Any, Any], tuple[Array, Any]] = lambda _, held: (held, None)
+    end: Callable[[Any, Array, Any, Array, Array], tuple[Any, Array | None]] = lambda _, __, ___, ____, new: (new, None)
+    sums: int = 0
 
 
-def of_law(prepare: Callable[[Any, Array], Any] = lambda law, _: law) -> Update:
-    """That of laws, which are the coefficients; `prepare` may change them, from their biases."""
+def of_law(
+    prepare: Callable[[Any, Array], Any] = lambda law, _: law, law_of: Callable[[Any], Any] = lambda law: law
+) -> Update:
+    """That of laws, the coefficients or in them (`law_of`); `prepare` gives those of normals, from their biases."""
     return Update(
         lambda law, bias, impulse, error: prepare(law, bias).update(impulse, error),
         lambda law, bias, impulse, error: prepare(law, bias).push(impulse[:1], error),
-        lambda law, _, impulse, normal, error: jnp.stack(law.hold(normal[0], tuple(impulse[1:]), tuple(error))),
+        lambda law, _, impulse, normal, error: jnp.stack(law_of(law).hold(normal[0], tuple(impulse[1:]), tuple(error))),
     )
 
 
@@ -58,8 +68,8 @@ def run(
     coefficients: tuple[object, ...],
     biases: tuple[Array, ...],
     velocity: Array,
-    impulses: tuple[Array, ...],
-) -> tuple[Array, tuple[Array, ...]]:
+    impulses: tuple[Any, ...],
+) -> tuple[Array, tuple[Any, ...]]:
     """A number of sweeps, for use inside of custom derivatives.
 
     Args:
@@ -67,8 +77,9 @@ def run(
       rows: groups of rows, swept in this order.
       update: of each sweep, from its number. It looks at each column by itself.
       coefficients: what the update gets of each group, with a leading turn axis.
-      biases, impulses: of each group (turn, row, column, world).
-      velocity: (component, block, world) with those impulses.
+      biases: of each group (turn, row, column, world).
+      velocity: (component, block, world) with the impulses, the sums of the update behind it.
+      impulses: of each group (turn, row, column, world); a pytree of such arrays where the update begins with one.
 
     Returns:
       The velocity and the impulses after the sweeps.
@@ -86,11 +97,11 @@ def by_turns(
     coefficients: tuple[object, ...],
     biases: tuple[Array, ...],
     velocity: Array,
-    impulses: tuple[Array, ...],
-) -> tuple[Array, tuple[Array, ...]]:
+    impulses: tuple[Any, ...],
+) -> tuple[Array, tuple[Any, ...]]:
     """`run` turn by turn, on any device. Its derivative is that of every update."""
 
-    def sweep(number: Array | int, carry: tuple[Array, tuple[Array, ...]]) -> tuple[Array, tuple[Array, ...]]:
+    def sweep(number: Array | int, carry: tuple[Array, tuple[Any, ...]]) -> tuple[Array, tuple[Any, ...]]:
         return once(rows, update(number), coefficients, biases, *carry)
 
     start = (velocity, impulses)
@@ -104,13 +115,16 @@ def _in_one_kernel(
     coefficients: tuple[object, ...],
     biases: tuple[Array, ...],
     velocity: Array,
-    impulses: tuple[Array, ...],
-) -> tuple[Array, tuple[Array, ...]]:
-    """`run` on a GPU."""
+    impulses: tuple[Any, ...],
+) -> tuple[Array, tuple[Any, ...]]:
+    """`run` on a GPU. What is held of a group is one array there."""
 
-    def answer_of(group: Rows) -> visits.Answer:
+    def answer_of(group: Rows, like: Any) -> visits.Answer:
         def answer(number: Array, moving: list[Array], values: tuple, impulse: Array) -> tuple[list[Array], Array]:
-            return _answer(group.law, update(number), impulse.shape[1], moving, (*values, impulse))
+            held = (*values, _apart(impulse, like, 0))
+            moving = [of_side[: velocity.shape[0] - update(number).sums] for of_side in moving]
+            changes, new = _answer(group.law, update(number), impulse.shape[1], moving, held)
+            return changes, _together(new, 0)
 
         return answer
 
@@ -118,7 +132,24 @@ def _in_one_kernel(
         visited(group, (group.matrix, bias, coefficient))
         for group, bias, coefficient in zip(rows, biases, coefficients, strict=True)
     )
-    return visits.run(iterations, [answer_of(group) for group in rows], groups, velocity, impulses)
+    answers = [answer_of(group, impulse) for group, impulse in zip(rows, impulses, strict=True)]
+    velocity, found = visits.run(iterations, answers, groups, velocity, tuple(_together(x, 1) for x in impulses))
+    return velocity, tuple(_apart(x, like, 1) for x, like in zip(found, impulses, strict=True))
+
+
+def _together(held: Any, axis: int) -> Array:
+    """The arrays of a pytree behind one another along the axis of the rows."""
+    leaves = jax.tree.leaves(held)
+    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=axis)
+
+
+def _apart(array: Array, like: Any, axis: int) -> Any:
+    """The reverse; `like` has the rows on its axis 1."""
+    leaves, structure = jax.tree.flatten(like)
+    if len(leaves) == 1:
+        return jax.tree.unflatten(structure, [array])
+    sizes = [leaf.shape[1] for leaf in leaves]
+    return jax.tree.unflatten(structure, lax.split(array, sizes, axis))
 
 
 def once(
@@ -138,8 +169,8 @@ def once(
 
 
 def _sweep(
-    group: Rows, update: Update, coefficients: object, bias: Array, velocity: Array, impulse: Array
-) -> tuple[Array, Array]:
+    group: Rows, update: Update, coefficients: object, bias: Array, velocity: Array, impulse: Any
+) -> tuple[Array, Any]:
     """One pass over the turns of a group."""
     table: Table | TracedTable = group.table
     fixed = (group.matrix, bias, coefficients)
@@ -154,7 +185,7 @@ def _sweep(
             at_turn = jax.tree.map(lambda x, turn=turn: x[turn], scanned)
             velocity, at_turn = _turn(group.law, update, table.together, velocity, blocks, receivers, at_turn)
             new.append(at_turn)
-        return velocity, jnp.stack(new)
+        return velocity, jax.tree.map(lambda *turns: jnp.stack(turns), *new)
 
     def body(velocity: Array, at_turn: tuple) -> tuple[Array, Array]:
         blocks, receivers, values = at_turn
@@ -173,11 +204,11 @@ def _sweep_places(group: Rows, update: Update, fixed: tuple, velocity: Array, im
         turn, velocity, impulse = carry
         blocks, values = counter.row((places.blocks, (*fixed, impulse)), turn)
         *values, old = values
-        matrix: RowMatrix = values[0]
         # The old impulse is stored: read again after its place is overwritten, all of them would be copied every turn.
-        old = store(old, matrix.like)
+        old = jax.tree.map(lambda x: store(x, x), old)
         velocity, new = _turn(group.law, update, group.table.together, velocity, blocks, blocks, (*values, old))
-        return counter.following(turn), velocity, counter.put(impulse, new, turn)
+        impulse = jax.tree.map(lambda all_turns, own: counter.put(all_turns, own, turn), impulse, new)
+        return counter.following(turn), velocity, impulse
 
     turns = group.table.turn_count if places.turns is None else places.turns
     return lax.fori_loop(0, turns, body, (counter.start(), velocity, impulse))[1:]
@@ -187,14 +218,16 @@ def _turn(
     law: Law, update: Update, together: int, velocity: Array, blocks: tuple, receivers: object, values: tuple
 ) -> tuple[Array, Array]:
     """Solves the rows of one turn side by side."""
-    moving = [gather(velocity, side, together) for side in blocks]
+    components = velocity.shape[0] - update.sums
+    moving = [gather(velocity[:components], side, together) for side in blocks]
     changes, new = _answer(law, update, together, moving, values)
     return receive(velocity, receivers, changes), new
 
 
 def _answer(law: Law, update: Update, together: int, moving: list[Array], values: tuple) -> tuple[list[Array], Array]:
     """How the velocity (component, constraint, world) of each side changes, and the new impulses of a turn."""
-    matrix, bias, coefficients, impulse = values
+    matrix, bias, coefficients, held = values
+    impulse, remembered = update.begin(coefficients, held)
     # Errors and impulses are stored: what is not is computed again by all that reads it, of the later turns, too.
     if isinstance(law, Cone):
         first, others = matrix.first_row(), matrix.other_rows()
@@ -202,9 +235,19 @@ def _answer(law: Law, update: Update, together: int, moving: list[Array], values
         pushed = first.changes_once(normal - impulse[:1], together)
         moving = [store(old + part, old) for old, part in zip(moving, pushed, strict=True)]
         error = store(bias[1:] + others.rates(moving), others.like)
-        held = store(update.others(coefficients, bias, impulse, normal, error), others.like)
-        changes = [a + b for a, b in zip(pushed, others.changes(held - impulse[1:], together), strict=True)]
-        return changes, jnp.concatenate([normal, held])
-    error = store(bias + matrix.rates(moving), matrix.like)
-    new = store(update.at_once(coefficients, bias, impulse, error), matrix.like)
-    return matrix.changes(new - impulse, together), new
+        tangents = store(update.others(coefficients, bias, impulse, normal, error), others.like)
+        new = jnp.concatenate([normal, tangents])
+        changes = [a + b for a, b in zip(pushed, others.changes(tangents - impulse[1:], together), strict=True)]
+    else:
+        error = store(bias + matrix.rates(moving), matrix.like)
+        new = store(update.at_once(coefficients, bias, impulse, error), matrix.like)
+        changes = matrix.changes(new - impulse, together)
+    held, sums = update.end(coefficients, bias, remembered, impulse, new)
+    return changes if sums is None else _with_sums(changes, sum_over_points(sums, together)), held
+
+
+def _with_sums(changes: list[Array], sums: Array) -> list[Array]:
+    """The changes (component, constraint, world) with sums behind them, which one side receives."""
+    first, *others = (jnp.broadcast_to(change, (*change.shape[:-1], sums.shape[-1])) for change in changes)
+    nothing = jnp.zeros_like(sums)
+    return [jnp.concatenate([first, sums]), *(jnp.concatenate([change, nothing]) for change in others)]

@@ -20,6 +20,7 @@ from tests.scenes import GRAVITY, box_stack
 
 TIERS: dict[str, dict[str, Any]] = {
     "pgs": {},
+    "pgs, conjugate": {"conjugate": True},
     "pgs, 40 sweeps": {"velocity_iterations": 40},
     "soft_step": {"solver": "soft_step"},
     "soft_step, 16 substeps": {"solver": "soft_step", "substeps": 16},
@@ -376,7 +377,7 @@ def _stack(count: int, tested: tuple[str, ...], peers: str) -> Case:
         10.0,
         lambda run: standing(run, float(count)),
         REST,
-        ALL,
+        (*ALL, "pgs, conjugate"),
         tested,
         peers=peers,
     )
@@ -422,15 +423,20 @@ CASES: tuple[Case, ...] = (
     _elastic(1 / 240, np.inf),
     _elastic(1e-3, 10.0),
     _cubes(1.0, FINER, ("pgs", "soft_step", "converged"), ""),
-    _cubes(1e2, FINER, ("converged",), "dip: PyBullet (50 iterations) 0.021, MuJoCo 0.05"),
-    _cubes(1e3, FINER, ("converged",), "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails"),
+    _cubes(1e2, FINER, ("pgs, conjugate", "converged"), "dip: PyBullet (50 iterations) 0.021, MuJoCo 0.05"),
+    _cubes(
+        1e3,
+        FINER,
+        ("converged",),
+        "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails",
+    ),
     _dragged(1.0, FINER, ()),
     _dragged(1e2, FINER, ()),
     _dragged(1e3, FINER, ("converged",)),
     _loaded_pyramid(100.0),
     _loaded_pyramid(300.0),
-    _two_small(400, 10.0, ()),
-    _two_small(8000, 0.5, ("converged",)),
+    _two_small(400, 10.0, ("pgs, conjugate",)),
+    _two_small(8000, 0.5, ("pgs, conjugate", "converged")),
     Case(
         "B2c",
         "cube on crossed sticks, mass ratio 200",
@@ -441,9 +447,13 @@ CASES: tuple[Case, ...] = (
         ("pgs", "soft_step", "soft_step, 16 substeps", "converged"),
         ("converged",),
     ),
-    _stack(10, ("soft_step", "converged"), "PyBullet collapses (10 iterations), leans 0.017 (50); MuJoCo dips 0.0014"),
-    _stack(20, ("soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),
-    _stack(40, ("converged",), "PyBullet collapses; MuJoCo dips 0.0056; soft steps, in theory, 0.011"),
+    _stack(
+        10,
+        ("pgs, conjugate", "soft_step", "converged"),
+        "PyBullet collapses (10 iterations), leans 0.017 (50); MuJoCo dips 0.0014",
+    ),
+    _stack(20, ("pgs, conjugate", "soft_step", "converged"), "PyBullet collapses; MuJoCo dips 0.0028"),
+    _stack(40, ("pgs, conjugate", "converged"), "PyBullet collapses; MuJoCo dips 0.0056; soft steps, in theory, 0.011"),
     _column("spheres", Sphere(0.5), ("soft_step",)),
     _column("cylinders", Cylinder(0.5, 0.5), ("soft_step",)),
     Case(

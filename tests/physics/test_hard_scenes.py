@@ -33,6 +33,8 @@ def test_gates(case, tier, gate):
     ("name", "tier", "seconds"),
     [
         ("A1 balls on a board, pushed diagonally", "pgs", 0.5),
+        ("B1 cube of 100 times the mass on a cube", "pgs, conjugate", 1.0),
+        ("B3 stack of 20 cubes", "pgs, conjugate", 1.0),
         ("B7a ball of 672 links' mass on a chain of 40", "pgs", 3.5),
         pytest.param("B7b bridge of 160 links", "pgs", 3.5, marks=pytest.mark.slow),
     ],

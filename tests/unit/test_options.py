@@ -21,6 +21,7 @@ DEFAULTS = {
     "pair_capacity": None,
     "touching_capacity": None,
     "solver": "pgs",
+    "conjugate": False,
     "exact_joints": True,
     "substeps": None,
     "impact_events": 0,
@@ -42,6 +43,12 @@ def test_every_extra_can_be_zero(name):
 def test_numbers_of_numpy_are_numbers():
     options = Options(dt=np.float32(0.5), velocity_iterations=np.int64(3))
     assert (options.dt, options.velocity_iterations) == (0.5, 3)
+
+
+@pytest.mark.parametrize("solver", ["soft_step", "converged"])
+def test_conjugate_directions_are_those_of_sweeps(solver):
+    with pytest.raises(ValueError, match=r"Options.conjugate needs solver='pgs'"):
+        Options(conjugate=True, solver=solver)
 
 
 def test_options_are_frozen_hashable_and_comparable():

@@ -63,6 +63,8 @@ SCENES = {
     "box": lambda: boxes(1, Options(dt=1 / 240)),
     "boxes": lambda: boxes(3, Options(dt=1 / 240)),
     "boxes by places": lambda: boxes(4, Options(dt=1 / 240, pair_capacity=8)),
+    "boxes along directions": lambda: boxes(3, Options(dt=1 / 240, conjugate=True)),
+    "boxes by places along directions": lambda: boxes(4, Options(dt=1 / 240, pair_capacity=8, conjugate=True)),
     "boxes in soft steps": lambda: boxes(2, Options(dt=1 / 240, solver="soft_step")),
     "boxes, converged": lambda: boxes(2, Options(dt=1 / 240, solver="converged")),
     "balls by places": lambda: balls(Options(dt=1 / 240, pair_capacity=10)),
@@ -107,7 +109,7 @@ def forget_traces():
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("name", slow_but(("box", "balls by places"), SCENES))
+@pytest.mark.parametrize("name", slow_but(("box", "balls by places", "boxes by places along directions"), SCENES))
 def test_a_step_is_the_same(name, make_for_gpu, gate):
     model, speeds, move = motion(name)
     expected = jax.jit(move)(model, speeds)
