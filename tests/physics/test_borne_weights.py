@@ -41,6 +41,18 @@ def test_at_once(precision, masses, gate):
     gate("speed / that of a fall in one step", np.asarray(state.velocity) * 60 / GRAVITY, tolerance)
 
 
+@pytest.mark.parametrize("masses", [COLUMNS["like masses"], (1.0, 100.0)], ids=["like masses", "heavy on light"])
+def test_derivatives_by_the_masses(masses, gate):
+    """What the ground bears grows by gravity with each mass."""
+    model, state = column(masses)
+
+    def borne(mass):
+        return jnp.abs(step(dataclasses.replace(model, mass=mass), state).contact_force[:, 1]).max()
+
+    found = jax.jit(jax.grad(borne))(model.mass)[1:]
+    gate("derivative / gravity - 1", found / GRAVITY - 1, 5e-3)
+
+
 def test_beside_one_that_slides():
     """A world is solved in the same way, whatever slides in another one."""
     model, state = column(COLUMNS["heavy on light"])
