@@ -93,7 +93,7 @@ class _Parts(NamedTuple):
 def run(
     iterations: int,
     update: Update,
-    coefficients: Callable[[Array, Array], tuple[Any, ...]],
+    coefficients: Callable[[Array, Array], tuple[tuple[Any, ...], ...]],
     momentum: Callable[[Array], Array],
     rows: tuple[Rows, ...],
     biases: tuple[Array, ...],
@@ -104,32 +104,26 @@ def run(
 
     Args:
       iterations: that number.
-      update: how turns find their impulses.
-      coefficients: of each group, from the number of the sweep and how many contacts (world,) slide after the one before.
+      update: how turns find their impulses, from coefficients that begin with those given here.
+      coefficients: tuple of each group, its law first, from the number of the sweep and how many contacts (world,) slide
+        after the one before.
       momentum: (component, block, world) of a change of the velocity.
       rows, biases, velocity, impulses: as in `sweeps.run`.
     """
     worlds = velocity.shape[-1]
     # By the largest mass, so that energies of tiny and of huge scenes stay within the range of float32.
     unit = compute_once(1.0 / greatest(momentum(jnp.ones_like(velocity))[0]), velocity)
-    inner = Update(
-        lambda given, *rest: update.at_once(given[0], *rest),
-        lambda given, *rest: update.first(given[0], *rest),
-        lambda given, *rest: update.others(given[0], *rest),
-        _begin,
-        _end,
-        SUMS,
-    )
+    along = update._replace(begin=_begin, end=_end, sums=SUMS)
 
     def one(number: Array, before: tuple[Any, ...]) -> tuple[Any, ...]:
         parts, held, way, size, risen, slides = before
         parts = parts.along(way)
         given = tuple(
-            (of_group, jax.tree.map(lambda x, group=group: jnp.broadcast_to(x, (group.bias.shape[0], 1, worlds)), way))
+            (*of_group, jax.tree.map(lambda x, group=group: jnp.broadcast_to(x, (group.bias.shape[0], 1, worlds)), way))
             for of_group, group in zip(coefficients(number, slides), rows, strict=True)
         )
         start = jnp.concatenate([parts.start, jnp.zeros((SUMS, *velocity.shape[1:]), velocity.dtype)])
-        swept, held = sweeps.run(1, rows, lambda _: inner, given, biases, start, held)
+        swept, held = sweeps.run(1, rows, lambda _: along, given, biases, start, held)
         swept, work = swept[: len(velocity)], add_slices(store(swept, swept)[len(velocity) :], 1)
         change = store(swept - parts.start, velocity)
         moved = store(momentum(change) * unit, velocity)
@@ -168,14 +162,14 @@ def _still(values: Array) -> _Parts:
     return _Parts(values, values, jnp.zeros_like(values), values)
 
 
-def _begin(given: tuple[Any, Along], parts: _Parts) -> tuple[Array, _Parts]:
-    ahead = parts.along(given[1])
+def _begin(given: tuple[Any, ...], parts: _Parts) -> tuple[Array, _Parts]:
+    ahead = parts.along(given[-1])
     return ahead.start, ahead
 
 
-def _end(given: tuple[Any, Along], bias: Array, parts: _Parts, impulse: Array, new: Array) -> tuple[_Parts, Array]:
+def _end(given: tuple[Any, ...], bias: Array, parts: _Parts, impulse: Array, new: Array) -> tuple[_Parts, Array]:
     """What is held of a turn, and what it adds to the slope by its biases and to the number of contacts that slide."""
-    law = given[0][0]
+    law = given[0]
     slope = bias[0] * (new[0] - impulse[0])  # tangents have no bias
     if not isinstance(law, Cone):
         return parts._replace(swept=new), jnp.stack([slope, jnp.zeros_like(slope)])

@@ -89,7 +89,7 @@ def solve(
 
         return sweeps.run(iterations, rows, of_number, laws, biases, velocity, impulses)
 
-    def with_factor(number: Array, slides: Array) -> tuple[Any, ...]:
+    def with_factor(number: Array, slides: Array) -> tuple[tuple[Any, ...], ...]:
         factor = jnp.where(slides > 0, longer(number), 1.0).astype(velocity.dtype)
         return tuple(
             (law, jnp.broadcast_to(factor, (group.bias.shape[0], 1, *factor.shape)))

@@ -139,17 +139,13 @@ def _in_one_kernel(
 
 def _together(held: Any, axis: int) -> Array:
     """The arrays of a pytree behind one another along the axis of the rows."""
-    leaves = jax.tree.leaves(held)
-    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves, axis=axis)
+    return jnp.concatenate(jax.tree.leaves(held), axis=axis)
 
 
 def _apart(array: Array, like: Any, axis: int) -> Any:
     """The reverse; `like` has the rows on its axis 1."""
     leaves, structure = jax.tree.flatten(like)
-    if len(leaves) == 1:
-        return jax.tree.unflatten(structure, [array])
-    sizes = [leaf.shape[1] for leaf in leaves]
-    return jax.tree.unflatten(structure, lax.split(array, sizes, axis))
+    return jax.tree.unflatten(structure, lax.split(array, [leaf.shape[1] for leaf in leaves], axis))
 
 
 def once(

@@ -160,9 +160,10 @@ def _apply(equation: Any, columns: int, values: list[np.ndarray | None]) -> list
     """One operation; the arrays have the axes that are neither of columns nor of worlds."""
     name, given = equation.primitive.name, equation.params
     if name in _ELEMENTWISE:
-        goal = equation.outvars[0].aval.shape
-        aligned = [_shared(x, of.aval.shape, goal) for x, of in zip(values, equation.invars, strict=True)]  # type: ignore[arg-type]
-        return [_each(_ELEMENTWISE[name], *aligned)]
+        goal, inputs = equation.outvars[0].aval.shape, [x.aval.shape for x in equation.invars]
+        # An axis of size 1 may stand for columns or worlds of others.
+        pairs = zip(values, inputs, strict=True)
+        return [_each(_ELEMENTWISE[name], *(_broadcast(x, size, goal, tuple(range(len(size)))) for x, size in pairs))]  # type: ignore[arg-type]
     if name in _UNCHANGED:
         return values[: len(equation.outvars)]  # type: ignore[return-value]
     first: Any = values[0]
@@ -239,14 +240,6 @@ def _broadcast(array: np.ndarray, have: tuple[int, ...], shape: tuple[int, ...],
             sizes[axis] = size
     wanted = [size for size, goal in zip(sizes, shape, strict=True) if _is_natural(goal)]
     return np.broadcast_to(array[(*index, ...)].reshape(wanted), _natural(shape))
-
-
-def _shared(array: np.ndarray, have: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
-    """Without axes of size 1 that stand for columns or worlds of others."""
-    if len(have) != len(shape):
-        return array
-    index = [slice(None) if _is_natural(goal) else 0 for x, goal in zip(have, shape, strict=True) if _is_natural(x)]
-    return array[(*index, ...)]
 
 
 def _reduced(name: str, array: np.ndarray, have: tuple[int, ...], given: dict[str, Any], columns: int) -> np.ndarray:

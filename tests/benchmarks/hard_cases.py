@@ -424,12 +424,7 @@ CASES: tuple[Case, ...] = (
     _elastic(1e-3, 10.0),
     _cubes(1.0, FINER, ("pgs", "soft_step", "converged"), ""),
     _cubes(1e2, FINER, ("pgs, conjugate", "converged"), "dip: PyBullet (50 iterations) 0.021, MuJoCo 0.05"),
-    _cubes(
-        1e3,
-        FINER,
-        ("converged",),
-        "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails",
-    ),
+    _cubes(1e3, FINER, ("converged",), "PyBullet throws the small cube out; MuJoCo 0.48; RaiSim's solver fails"),
     _dragged(1.0, FINER, ()),
     _dragged(1e2, FINER, ()),
     _dragged(1e3, FINER, ("converged",)),
