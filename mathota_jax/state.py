@@ -41,6 +41,11 @@ class Flag(enum.IntFlag):
     """A leaf of the model is not finite or out of range: a negative friction, a restitution beyond 0 to 1, a length of a
     shape that is not positive. (A mass or a moment of inertia that is not positive makes the motion NaN.)"""
 
+    DEEP_OVERLAP = 128
+    """At the start of a step two bodies overlapped by more than half of the inner radius of the smaller one: the solver can
+    not hold what presses it (heavy on light: `Options.conjugate`, more sweeps, another solver), something flew into it
+    (smaller steps, `Options.continuous`), or the state was given so."""
+
 
 @pytree
 class Sleep:
