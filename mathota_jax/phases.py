@@ -50,7 +50,7 @@ from mathota_jax.dynamics.free_motion import drift, free_velocity
 from mathota_jax.dynamics.integrate import displace
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
-from mathota_jax.solver import converged, linear_sweeps, pgs, soft_step
+from mathota_jax.solver import converged, pgs, soft_step
 from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import in_every_world, put, take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
@@ -270,7 +270,7 @@ def _sweep(
 
 
 def _gradient_iterations(scene: Scene, rows: tuple[Rows, ...], iterations: int) -> int:
-    return scene.options.gradient_iterations or linear_sweeps.enough_for_derivatives(rows, iterations)
+    return pgs.gradient_sweeps(rows, iterations, scene.options.gradient_iterations)
 
 
 def small_steps(

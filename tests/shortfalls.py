@@ -30,9 +30,6 @@ SHORTFALLS: dict[str, str] = {
     "tests/gradients/test_slide_gradient.py::test_a_spinning_box_that_just_touches": "the derivative by the mass is 7 % too "
     "large, that by the height and the position without bound: of four corners at the height 0 to round-off some carry "
     "none of the load, and their shares are undetermined; right for one step, and where the box is pressed in by 5 um",
-    "tests/physics/test_borne_weights.py::test_derivatives_by_the_masses[heavy on light]": "what the ground bears grows "
-    "with a mass of 100 kg on one of 1 kg by 4.2 and -1.6 m/s^2 instead of 9.81: the linear sweeps behind a derivative do "
-    "not go along conjugate directions; four like masses 4e-4, the converged solver 1.6e-3",
     "tests/unit/test_convex.py::test_many_random_poses[float64-cone_cone]": "one of 952 poses, half overlapped, ends in a "
     "local minimum of the depth 4.3e-3 of the size too deep (flagged, as 2 % of the deep ones are); in float32 none",
 }

@@ -30,7 +30,7 @@ from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
 from mathota_jax.constraints.swept import misses
 from mathota_jax.model import Model
-from mathota_jax.solver import linear_sweeps, pgs
+from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import (
@@ -244,7 +244,7 @@ def _rounds(
             rebounds.append(jnp.concatenate([rebound, zero[:, 1:]], axis=1))
             rows.append(dataclasses.replace(chosen, bias=zero))
         start = tuple(jnp.zeros_like(part) for part in total)
-        gradient = scene.options.gradient_iterations or linear_sweeps.enough_for_derivatives(tuple(rows), iterations)
+        gradient = pgs.gradient_sweeps(tuple(rows), iterations, scene.options.gradient_iterations)
 
         def with_restitution(share: Array | float) -> Impulses:
             biased = tuple(

@@ -34,7 +34,8 @@ from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.pgs import linearise
 from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
+from mathota_jax.solver.slopes import slopes_of
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices, add_slices, largest_slice
@@ -341,9 +342,9 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple:
     if not rows:
         return (velocity, impulses, failed), (d_velocity, impulses, jnp.zeros_like(failed))
     d_velocity, errors, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
-    jacobians = tuple(
-        implicit.jacobians_of(group.law, impulse, error)
-        for group, impulse, error in zip(rows, impulses, errors, strict=True)
+    slopes = tuple(
+        slopes_of(group.law, impulse, error) for group, impulse, error in zip(rows, impulses, errors, strict=True)
     )
-    d_velocity, d_impulses = implicit.solve(rows, jacobians, right_sides, d_velocity)
+    d_impulses = implicit.solve(rows, slopes, right_sides)
+    d_velocity = add_impulses(visiting_all_turns(rows), d_velocity, d_impulses)
     return (velocity, impulses, failed), (d_velocity, d_impulses, jnp.zeros_like(failed))

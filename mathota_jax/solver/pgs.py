@@ -2,10 +2,10 @@
 
 The solver knows rows (`rows`), not contacts or joints.
 
-The derivative is that of the fixed point: it satisfies a linear system with the same sparsity, solved by the same
-sweeps with the law replaced by its Jacobian. Those sweeps are linear in what they carry, so their transpose stores
-nothing: reverse mode needs memory constant in the number of sweeps. The initial impulses do not move the fixed point and
-have no derivative.
+The derivative is that of the fixed point. It satisfies a linear system: that of few bodies is solved densely (`implicit`),
+that of many, which has the same sparsity, by the same sweeps with the law replaced by its Jacobian (`linear_sweeps`).
+Neither stores what it passes through: reverse mode needs memory constant in the number of sweeps. The initial impulses do
+not move the fixed point and have no derivative.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from mathota_jax.solver import conjugate, linear_sweeps, sweeps
+from mathota_jax.solver import conjugate, implicit, linear_sweeps, sweeps
 from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.rows import (
     Rows,
@@ -56,7 +56,7 @@ def solve(
 
     Args:
       iterations: number of sweeps, 0 if the impulses are known to be solved.
-      gradient_iterations: number of sweeps of the linear solver behind a derivative.
+      gradient_iterations: number of sweeps of the linear solver behind a derivative; 0 for a dense system instead.
       rows: groups of rows, solved in this order within a sweep.
       velocity: (component, block, world) without any constraint impulse.
       impulses: for each group (turn, row, column, world), the impulses to start from.
@@ -100,6 +100,13 @@ def solve(
     return conjugate.run(iterations, update, with_factor, momentum, rows, biases, velocity, impulses)
 
 
+def gradient_sweeps(rows: tuple[Rows, ...], iterations: int, asked: int | None) -> int:
+    """Sweeps behind the derivative of so many `iterations`: those asked for, if any; 0 for one dense system."""
+    if asked:
+        return asked
+    return 0 if implicit.is_small(rows) else linear_sweeps.enough_for_derivatives(rows, iterations)
+
+
 def _couple(rows: tuple[Rows, ...]) -> bool:
     """Whether impulses of contacts travel from block to block; on one block alone sweeps get far enough."""
     sides = [group.table.blocks if group.places is None else group.places.blocks for group in rows]
@@ -118,7 +125,10 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     slopes = tuple(
         slopes_of(group.law, impulse, error) for group, impulse, error in zip(rows, impulses, errors, strict=True)
     )
-    d_impulses = linear_sweeps.solve(gradient_iterations, rows, slopes, right_sides)
+    if gradient_iterations:
+        d_impulses = linear_sweeps.solve(gradient_iterations, rows, slopes, right_sides)
+    else:
+        d_impulses = implicit.solve(rows, slopes, right_sides)
     return (velocity, impulses), (add_impulses(visiting_all_turns(rows), d_velocity, d_impulses), d_impulses)
 
 

@@ -30,6 +30,11 @@ class BoundedSlopes:
     by_impulse: Array
     by_error: Array
 
+    @property
+    def masses(self) -> Array:
+        """Effective mass of each row, (..., row, column, world); 0 where there is none."""
+        return -self.by_error
+
     def update(self, impulse: Array, error: Array) -> Array:
         """Change of the new impulses by those of the impulses before and of the errors."""
         return self.by_impulse * impulse + self.by_error * error
@@ -37,6 +42,14 @@ class BoundedSlopes:
     def transposed(self, new: Array) -> tuple[Array, Array]:
         """The transpose of `update`."""
         return self.by_impulse * new, self.by_error * new
+
+    def resolve(self, change: Array, delta: float) -> Array:
+        """The impulses x of which ``(1 + delta) x`` is their `update` without errors, plus a change."""
+        return change / (1.0 + delta - self.by_impulse)
+
+    def resolve_back(self, change: Array, delta: float) -> Array:
+        """The transpose of `resolve`."""
+        return self.resolve(change, delta)
 
 
 @pytree
@@ -57,6 +70,11 @@ class ConeSlopes:
     grip: Array
     direction: tuple[Array, Array]
     friction: Array
+
+    @property
+    def masses(self) -> Array:
+        """As `BoundedSlopes.masses`, of a whole table."""
+        return self._stack(self.normal_mass, [self.tangent_mass, self.tangent_mass], 1)
 
     def update(self, impulse: Array, error: Array) -> Array:
         """As `BoundedSlopes.update`."""
@@ -82,6 +100,29 @@ class ConeSlopes:
         free = self.hold_back(tangents)
         by_error = self._stack(-self.normal_mass * normal, [-self.tangent_mass * part for part in free], row)
         return self._stack(normal, free, row), by_error
+
+    def resolve(self, change: Array, delta: float) -> Array:
+        """As `BoundedSlopes.resolve`."""
+        row = change.ndim - 3
+        normal, *tangents = unstack(change, row)
+        normal = normal / (1.0 + delta - self.pressing)
+        pushed = self.friction * self.pressing * normal
+        tangents = [part + own * pushed for part, own in zip(tangents, self.direction, strict=True)]
+        return self._stack(normal, self._resolved(tangents, delta), row)
+
+    def resolve_back(self, change: Array, delta: float) -> Array:
+        """As `BoundedSlopes.resolve_back`."""
+        row = change.ndim - 3
+        normal, *tangents = unstack(change, row)
+        tangents = self._resolved(tangents, delta)
+        normal = normal + self.friction * self.pressing * self._along(tangents)
+        return self._stack(normal / (1.0 + delta - self.pressing), tangents, row)
+
+    def _resolved(self, tangents: Sequence[Array], delta: float) -> list[Array]:
+        """Across the direction of sliding and along it."""
+        across, along = 1.0 / (1.0 + delta - self.grip), 1.0 / (1.0 + delta)
+        more = (along - across) * self._along(tangents)
+        return [across * part + own * more for part, own in zip(tangents, self.direction, strict=True)]
 
     def push_back(self, normal: Array, tangents: Sequence[Array]) -> Array:
         """The transpose of `update` for the impulse of the normal row."""

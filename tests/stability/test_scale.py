@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Plane, SceneBuilder
+from mathota_jax import Box, Flag, Plane, SceneBuilder
 from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import GRAVITY, axis_angle, motion_and_penetration, record_worlds, stack, undamped
 
@@ -40,7 +40,7 @@ def run(worlds, step_count):
     """Records (step, world, ...) of worlds of one scene in float64, and how far each body is from its start."""
     models, states = stack([model for model, _ in worlds]), stack([state for _, state in worlds])
     final, record = record_worlds(models, states, step_count, motion_and_penetration)
-    assert not np.asarray(final.flags).any()
+    assert not (np.asarray(final.flags) & ~Flag.DEEP_OVERLAP).any()  # the cards start deep in each other
     record = {name: np.asarray(values, float) for name, values in record.items()}
     return record, record["position"] - np.asarray(states.position, float)
 
