@@ -84,7 +84,8 @@ def _inverse_of_block(matrix: Array) -> Array:
         return (jnp.where(here[:, None], row, rows), jnp.where(here, label, order)), None
 
     (rows, order), _ = lax.scan(pivot, (matrix, order), jnp.arange(count, dtype=jnp.int32))
-    return _product(rows, jnp.where(order[:, None] == numbers.astype(order.dtype), 1.0, 0.0).astype(rows.dtype))
+    places = jnp.stack([jnp.where(order == place, 1.0, 0.0) for place in range(count)], axis=1).astype(rows.dtype)
+    return _product(rows, _stored(places))
 
 
 def _stored(values: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The linear system behind the derivative of solved impulses, solved densely, in the velocities.
+"""The linear system behind the derivative of solved impulses, solved to round-off, by a dense one in the velocities.
 
 ``A x = r`` with ``A = 1 - K - H J M^-1 J^T``, K and H being the slopes of the laws. Redundant rows make it singular, though
 consistent: many impulses, one velocity. ``A + delta`` is regular, and its inverse needs one of the size of the velocities
@@ -8,7 +8,7 @@ consistent: many impulses, one velocity. ``A + delta`` is regular, and its inver
 
 Few steps along what this makes of the residual lead to a solution, whose velocity is the right one. A step along a mode of A
 of size s is wrong by delta / (delta + s), and by what round-off makes of S, which is large: the residual is found anew from
-A after each.
+A after each. Contacts of a single body have so few modes that the residuals themselves lead there.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mathota_jax.solver import velocity_system
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
-from mathota_jax.solver.slopes import Slopes
+from mathota_jax.solver.slopes import ConeSlopes, Slopes
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices
@@ -35,13 +35,17 @@ STEPS = 3
 """Measured in float32: residuals of 1e-6 for five boxes at rest and three that slide on one another, of 5e-4 for a cube of
 100 times the mass on a cube (3e-5 with a step more)."""
 
+STEPS_OF_ONE = {"float32": 7, "float64": 10}
+"""Steps along the residuals themselves, of which contacts of a single body need no more than it has velocities where they
+stick. Measured for a slab that slides: six leave 1e-5, eight 2e-6."""
+
 DELTA = {"float32": 1e-3, "float64": 1e-6}
 """Beside 1; in float32 round-off makes the first step wrong by some 1e-7 over its square."""
 
 FEW_BODIES = 6
-"""Moving bodies up to which a dense system costs hardly more than sweeps. Measured beside 15 of them (the whole gradient of a
-step, float32, 256 worlds): 1.04 to 1.12 of the time for a slab, 1.02 to 1.05 for five boxes, of whose answer to a kick those
-leave half. Of ten boxes, whose places change from step to step, 1.7."""
+"""Moving bodies up to which the solution costs hardly more than sweeps. Measured beside 15 of them (the whole gradient of a
+step, float32, 256 worlds): 0.95 of the time for a slab, 1.02 to 1.05 for five boxes, of whose answer to a kick they leave
+half. Of ten boxes, whose places change from step to step, 1.7."""
 
 Impulses = tuple[Array, ...]
 
@@ -64,12 +68,10 @@ def solve(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], right_sides: Impul
 
     def solve_forward(_: object, right_sides: Impulses) -> Impulses:
         weights = tuple(safe_divide(jnp.ones_like(mass), mass) for mass in masses)
-        nearly = functools.partial(system.nearly, system.inverse())
-        return _solve(nearly, lambda x: system.product(x, system.once), weights, right_sides, system.nothing)
+        return _solve(system.way(), lambda x: system.product(x, system.once), weights, right_sides, system.nothing)
 
     def solve_transposed(_: object, right_sides: Impulses) -> Impulses:
-        nearly = functools.partial(system.nearly_back, system.inverse())
-        return _solve(nearly, system.product_back, masses, right_sides, system.nothing)
+        return _solve(system.way_back(), system.product_back, masses, right_sides, system.nothing)
 
     return lax.custom_linear_solve(system.product, right_sides, solve_forward, transpose_solve=solve_transposed)
 
@@ -105,6 +107,19 @@ class _System:
             part - by_impulse - row_velocity(group, velocity)
             for part, (by_impulse, _), group in zip(x, both, self.swapped, strict=True)
         )
+
+    def way(self) -> Callable[[Impulses], Impulses]:
+        """Where a residual leads."""
+        return _stay if self.is_single else functools.partial(self.nearly, self.inverse())
+
+    def way_back(self) -> Callable[[Impulses], Impulses]:
+        """Where one of the transposed system does."""
+        return _stay if self.is_single else functools.partial(self.nearly_back, self.inverse())
+
+    @property
+    def is_single(self) -> bool:
+        """Whether contacts act on a single body, and nothing else does."""
+        return self.nothing.shape[1] == 1 and all(isinstance(slope, ConeSlopes) for slope in self.slopes)
 
     def inverse(self) -> velocity_system.Inverse:
         """``G^-1``."""
@@ -179,7 +194,12 @@ def _solve(
 
     zero = tuple(jnp.zeros_like(side) for side in right_sides)
     start = _Way(zero, zero, jnp.full(like.shape[-1:], jnp.inf, like.dtype))
-    return lax.fori_loop(0, STEPS, step, (zero, right_sides, start))[0]
+    steps = STEPS_OF_ONE[str(like.dtype)] if nearly is _stay else STEPS
+    return lax.fori_loop(0, steps, step, (zero, right_sides, start))[0]
+
+
+def _stay(residual: Impulses) -> Impulses:
+    return residual
 
 
 def _add(a: Impulses, factor: Array, b: Impulses) -> Impulses:

@@ -74,7 +74,8 @@ class ConeSlopes:
     @property
     def masses(self) -> Array:
         """As `BoundedSlopes.masses`, of a whole table."""
-        return self._stack(self.normal_mass, [self.tangent_mass, self.tangent_mass], 1)
+        tangent = self.pressing * self.tangent_mass
+        return self._stack(self.pressing * self.normal_mass, [tangent, tangent], 1)
 
     def update(self, impulse: Array, error: Array) -> Array:
         """As `BoundedSlopes.update`."""

@@ -53,14 +53,29 @@ def test_slabs_that_slide_as_one(precision, solver, gate):
     gate("by the friction below", by_friction / (-truth / (2 * FRICTIONS["bottom"])) - 1, 4e-3)
 
 
+def on_the_ground(half):
+    builder = SceneBuilder(gravity=DOWN)
+    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.5)
+    builder.add_body(Box(half), mass=1.0, position=(0, half[1], 0), friction=0.5)
+    return builder.build(undamped(dt=DT))
+
+
+SCENES = {
+    "cube": lambda: on_the_ground((0.1, 0.1, 0.1)),
+    "post": lambda: on_the_ground((0.02, 0.2, 0.02)),
+    "plank": lambda: on_the_ground((0.5, 0.01, 0.05)),
+    "five cubes": lambda: box_stack(5, options=undamped(dt=DT)),
+}
+
+
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
-@pytest.mark.parametrize("count", [1, 5])
-def test_what_is_pressed_and_sticks_takes_up_any_small_kick(precision, count, gate):
+@pytest.mark.parametrize("scene", SCENES)
+def test_what_is_pressed_and_sticks_takes_up_any_small_kick(precision, scene, gate):
     """All velocities after a step are 0, whatever they were before: so are their derivatives.
 
     Fifteen linear sweeps left 0.47 of a kick of five boxes.
     """
-    model, state = box_stack(count, options=undamped(dt=DT))
+    model, state = SCENES[scene]()
     state = advance(model, state, 300)
 
     def after(velocity, angular_velocity):
