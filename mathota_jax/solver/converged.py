@@ -35,7 +35,6 @@ from mathota_jax.solver.pgs import linearise
 from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
-from mathota_jax.solver.slopes import slopes_of
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices, add_slices, largest_slice
@@ -341,10 +340,7 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple:
     velocity, impulses, failed = solve(rows, velocity, impulses)
     if not rows:
         return (velocity, impulses, failed), (d_velocity, impulses, jnp.zeros_like(failed))
-    d_velocity, errors, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
-    slopes = tuple(
-        slopes_of(group.law, impulse, error) for group, impulse, error in zip(rows, impulses, errors, strict=True)
-    )
+    d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     d_impulses = implicit.solve(rows, slopes, right_sides)
     d_velocity = add_impulses(visiting_all_turns(rows), d_velocity, d_impulses)
     return (velocity, impulses, failed), (d_velocity, d_impulses, jnp.zeros_like(failed))

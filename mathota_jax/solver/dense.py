@@ -46,15 +46,15 @@ def inverse(matrix: Array, size: int) -> Array:
         block = _stored(_inverse_of_block(lax.dynamic_slice_in_dim(rows, first, size, axis=1)))
         unit = jnp.where(numbers[None] == first + numbers[:size, None], 1.0, 0.0)[..., None]
         rows = _stored(jnp.where(here[:, None], unit.astype(rows.dtype), rows))
-        rows = _stored(_product(block, rows))
+        rows = _stored(product(block, rows))
         columns = _stored(jnp.where(here[:, None, None], 0.0, columns))
-        others = jnp.where(here[:, None], 0.0, matrix) - _product(columns, rows)
+        others = jnp.where(here[:, None], 0.0, matrix) - product(columns, rows)
         return lax.dynamic_update_slice_in_dim(others, rows, first, axis=0), None
 
     return lax.scan(eliminate, matrix, jnp.arange(0, count, size, dtype=jnp.int32))[0]
 
 
-def _product(left: Array, right: Array) -> Array:
+def product(left: Array, right: Array) -> Array:
     """(a, b, world) of (a, k, world) and (k, b, world)."""
     return functools.reduce(jnp.add, [left[:, k, None] * right[None, k] for k in range(left.shape[1])])
 
@@ -85,7 +85,7 @@ def _inverse_of_block(matrix: Array) -> Array:
 
     (rows, order), _ = lax.scan(pivot, (matrix, order), jnp.arange(count, dtype=jnp.int32))
     places = jnp.stack([jnp.where(order == place, 1.0, 0.0) for place in range(count)], axis=1).astype(rows.dtype)
-    return _product(rows, _stored(places))
+    return product(rows, _stored(places))
 
 
 def _stored(values: Array) -> Array:

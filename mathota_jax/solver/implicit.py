@@ -26,7 +26,7 @@ from mathota_jax.solver import velocity_system
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
-from mathota_jax.solver.slopes import ConeSlopes, Slopes
+from mathota_jax.solver.slopes import ConeSlopes, Slopes, left_unanswered
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices
@@ -64,20 +64,22 @@ def solve(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], right_sides: Impul
       right_sides: r of each group.
     """
     system = _System(visiting_all_turns(rows), slopes, right_sides)
+    product = functools.partial(left_unanswered, system.rows, slopes, system.nothing)
     masses = tuple(slope.masses for slope in slopes)
 
     def solve_forward(_: object, right_sides: Impulses) -> Impulses:
         weights = tuple(safe_divide(jnp.ones_like(mass), mass) for mass in masses)
-        return _solve(system.way(), lambda x: system.product(x, system.once), weights, right_sides, system.nothing)
+        once = functools.partial(product, once=system.once)
+        return _solve(system.steps, system.way(), once, weights, right_sides, system.nothing)
 
     def solve_transposed(_: object, right_sides: Impulses) -> Impulses:
-        return _solve(system.way_back(), system.product_back, masses, right_sides, system.nothing)
+        return _solve(system.steps, system.way_back(), system.product_back, masses, right_sides, system.nothing)
 
-    return lax.custom_linear_solve(system.product, right_sides, solve_forward, transpose_solve=solve_transposed)
+    return lax.custom_linear_solve(product, right_sides, solve_forward, transpose_solve=solve_transposed)
 
 
 class _System:
-    """A, what is nearly its inverse, and the transposes of both."""
+    """What is nearly the inverse of A, and the transposes of both."""
 
     def __init__(self, rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], like: Impulses) -> None:
         self.rows, self.slopes = rows, slopes
@@ -89,14 +91,6 @@ class _System:
     def once(self, values: Any) -> Any:
         """Stored; not where something else has to be transposed through it."""
         return compute_once(values, self.nothing)
-
-    def product(self, x: Impulses, once: Callable = lambda velocity: velocity) -> Impulses:
-        """``A x``."""
-        velocity = once(add_impulses(self.rows, self.nothing, x))
-        return tuple(
-            part - slope.update(part, row_velocity(group, velocity))
-            for part, group, slope in zip(x, self.rows, self.slopes, strict=True)
-        )
 
     def product_back(self, x: Impulses) -> Impulses:
         """``A^T x``."""
@@ -120,6 +114,11 @@ class _System:
     def is_single(self) -> bool:
         """Whether contacts act on a single body, and nothing else does."""
         return self.nothing.shape[1] == 1 and all(isinstance(slope, ConeSlopes) for slope in self.slopes)
+
+    @property
+    def steps(self) -> int:
+        """How many lead from nothing to the solution."""
+        return STEPS_OF_ONE[str(self.nothing.dtype)] if self.is_single else STEPS
 
     def inverse(self) -> velocity_system.Inverse:
         """``G^-1``."""
@@ -162,13 +161,14 @@ class _Way(NamedTuple):
 
 
 def _solve(
+    steps: int,
     nearly: Callable[[Impulses], Impulses],
     product: Callable[[Impulses], Impulses],
     weights: Impulses,
     right_sides: Impulses,
     like: Array,
 ) -> Impulses:
-    """Solves ``product(x) = right sides`` by steps along `nearly(residual)`.
+    """Solves ``product(x) = right sides`` by a number of steps along `nearly(residual)`.
 
     Each leaves the least residual in the plane of its way and of the one before (P. Vinsome, "Orthomin", 1976): conjugate
     residuals where the product is symmetric by the weights, as it is where nothing slides.
@@ -194,7 +194,6 @@ def _solve(
 
     zero = tuple(jnp.zeros_like(side) for side in right_sides)
     start = _Way(zero, zero, jnp.full(like.shape[-1:], jnp.inf, like.dtype))
-    steps = STEPS_OF_ONE[str(like.dtype)] if nearly is _stay else STEPS
     return lax.fori_loop(0, steps, step, (zero, right_sides, start))[0]
 
 

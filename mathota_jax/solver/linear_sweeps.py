@@ -6,6 +6,7 @@ The sweeps are linear in what they carry, so their transpose stores nothing.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -15,8 +16,8 @@ from jax import Array, lax
 from mathota_jax.solver import sweeps
 from mathota_jax.solver.laws import Cone
 from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
-from mathota_jax.solver.slopes import ConeSlopes, Slopes
+from mathota_jax.solver.rows import Rows, visiting_all_turns
+from mathota_jax.solver.slopes import ConeSlopes, Slopes, left_unanswered
 from mathota_jax.solver.sweeps import Update
 from mathota_jax.spatial.settle import store
 from mathota_jax.struct import pytree
@@ -103,12 +104,7 @@ def solve(
     everywhere = visiting_all_turns(rows)  # the product is transposed too
     nothing = _no_velocity(rows)
 
-    def product(x: tuple[Array, ...]) -> tuple[Array, ...]:
-        velocity = add_impulses(everywhere, nothing, x)
-        return tuple(
-            part - slope.update(part, row_velocity(group, velocity))
-            for part, group, slope in zip(x, rows, slopes, strict=True)
-        )
+    product = functools.partial(left_unanswered, everywhere, slopes, nothing)
 
     def solve_forward(_: Callable, right_sides: tuple[Array, ...]) -> tuple[Array, ...]:
         def at_once(of_turn: tuple[Slopes, Array], _: Array, impulse: Array, error: Array) -> Array:

@@ -29,7 +29,7 @@ from mathota_jax.solver.rows import (
     row_velocity,
     visiting_all_turns,
 )
-from mathota_jax.solver.slopes import slopes_of
+from mathota_jax.solver.slopes import Slopes, slopes_of
 from mathota_jax.solver.sweeps import Update
 from mathota_jax.spatial.settle import compute_once, store_cotangents
 
@@ -121,10 +121,7 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
     rows, d_rows = _dense(rows, d_rows)
-    d_velocity, errors, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
-    slopes = tuple(
-        slopes_of(group.law, impulse, error) for group, impulse, error in zip(rows, impulses, errors, strict=True)
-    )
+    d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     if gradient_iterations:
         d_impulses = linear_sweeps.solve(gradient_iterations, rows, slopes, right_sides)
     else:
@@ -144,23 +141,23 @@ def _dense(rows: tuple[Rows, ...], d_rows: tuple[Rows, ...]) -> tuple[tuple[Rows
 
 def linearise(
     rows: tuple[Rows, ...], d_rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...], d_velocity: Array
-) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
+) -> tuple[Array, tuple[Slopes, ...], tuple[Array, ...]]:
     """Derivative of the fixed point of all laws, but for the change of the impulses. The matrices are dense.
 
     Returns:
-      The change of the velocity at fixed impulses; for each group the errors, and the change of its impulses at fixed
-      impulses.
+      The change of the velocity at fixed impulses; for each group the slopes of its law, and the change of its impulses at
+      fixed impulses.
     """
     for group, d_group, impulse in zip(visiting_all_turns(rows), d_rows, impulses, strict=True):
         d_velocity = add_changes(group, d_group.matrix, d_velocity, impulse)
-    errors, right_sides = [], []
+    slopes, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
         # The error goes into all slopes of the law, its cotangent into that of every entry of the matrix.
         error = compute_once(group.bias + row_velocity(group, velocity), velocity)
         d_error = d_group.bias + row_velocity(group, d_velocity)
         d_error = store_cotangents(d_error + matrix_velocity(group.table, d_group.matrix, group.places, velocity))
-        errors.append(error)
+        slopes.append(slopes_of(group.law, impulse, error))
         right_sides.append(
             jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023
         )
-    return d_velocity, tuple(errors), tuple(right_sides)
+    return d_velocity, tuple(slopes), tuple(right_sides)

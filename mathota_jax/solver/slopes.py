@@ -6,13 +6,14 @@ instead of the Jacobians. Arrays of changes are (row, column, world) or, for a w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.solver.laws import Bounded, Cone, Law
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
@@ -147,6 +148,25 @@ class ConeSlopes:
 
 
 Slopes = BoundedSlopes | ConeSlopes
+
+
+def left_unanswered(
+    rows: tuple[Rows, ...],
+    slopes: tuple[Slopes, ...],
+    nothing: Array,
+    impulses: tuple[Array, ...],
+    once: Callable[[Array], Array] = lambda velocity: velocity,
+) -> tuple[Array, ...]:
+    """``x - K x - H J M^-1 J^T x``: changes x of the impulses, less what the laws make of them and of their velocities.
+
+    `nothing` is the velocity without them, `once` what is done with that with them, for `compute_once`; left alone where
+    the product has to be transposed.
+    """
+    velocity = once(add_impulses(rows, nothing, impulses))
+    return tuple(
+        part - slope.update(part, row_velocity(group, velocity))
+        for part, group, slope in zip(impulses, rows, slopes, strict=True)
+    )
 
 
 def slopes_of(law: Law, impulse: Array, error: Array) -> Slopes:

@@ -268,10 +268,6 @@ def _apply(matrix: Array, vector: Array) -> Array:
     return matrix[:, 0] * vector[0] + matrix[:, 1] * vector[1] + matrix[:, 2] * vector[2]
 
 
-def _product(left: Array, right: Array) -> Array:
-    return sum((left[:, k, None] * right[k] for k in range(1, 3)), left[:, 0, None] * right[0])
-
-
 def _transposed(matrix: Array) -> Array:
     return jnp.swapaxes(matrix, 0, 1)
 
@@ -308,8 +304,8 @@ def _eliminate(inertia: tuple[Array, ...], side: Pair) -> tuple[tuple[Array, ...
 def _to_parent(inertia: tuple[Array, ...], across: Array) -> tuple[Array, Array, Array]:
     """The same inertia about the parent's centre."""
     linear, mixed, angular = inertia
-    moved = _once(mixed - _product(linear, across))
-    return linear, moved, angular + _product(across, moved) - _product(_transposed(mixed), across)
+    moved = _once(mixed - dense.product(linear, across))
+    return linear, moved, angular + dense.product(across, moved) - dense.product(_transposed(mixed), across)
 
 
 def _with_parent(motion: Pair, across: Array) -> Pair:

@@ -17,7 +17,7 @@ from jax import Array, lax
 from mathota_jax.solver import dense
 from mathota_jax.solver.rows import Rows
 from mathota_jax.spatial.settle import compute_once, materialize
-from mathota_jax.spatial.spread import FEW_SLICES, add_scaled, add_slices
+from mathota_jax.spatial.spread import add_scaled
 
 
 def solve_once(rows: tuple[Rows, ...], by_error: tuple[Array, ...], right_side: Array) -> Array:
@@ -110,8 +110,6 @@ def _scatter(group: Rows, total: Array, receiver: Array, source: Array, response
     product = functools.reduce(jnp.add, of_points)  # (turn, component, component', constraint, world)
     product = jnp.moveaxis(compute_once(product, product), 3, 1)
     product = product.reshape(-1, *product.shape[2:])
-    if group.places is None and count == 1 and len(product) <= FEW_SLICES:
-        return total + add_slices(product, 0)
     index = jnp.where((receiver < count) & (source < count), receiver * count + source, count * count)
     if group.places is None:
         return total.at[index.reshape(-1)].add(product, mode="drop")

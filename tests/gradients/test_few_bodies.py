@@ -10,7 +10,7 @@ import pytest
 from mathota_jax import Box, Plane, SceneBuilder, rollout, step
 from mathota_jax.solver import dense
 from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
-from tests.scenes import DOWN, GRAVITY, advance, box_stack, undamped
+from tests.scenes import DOWN, GRAVITY, advance, body_on_plane, box_stack, undamped
 
 SPEED, DT = 1.0, 1 / 240
 FRICTIONS = {"ground": 0.5, "bottom": 0.08, "others": 0.8}
@@ -54,10 +54,7 @@ def test_slabs_that_slide_as_one(precision, solver, gate):
 
 
 def on_the_ground(half):
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.5)
-    builder.add_body(Box(half), mass=1.0, position=(0, half[1], 0), friction=0.5)
-    return builder.build(undamped(dt=DT))
+    return body_on_plane(Box(half), position=(0, half[1], 0), options=undamped(dt=DT))
 
 
 SCENES = {
