@@ -8,26 +8,35 @@ Writes ``results/pose_classes.json`` and ``.md``; what earlier runs found for ot
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mathota_jax import Box, Capsule, Cone, Cylinder, Geometry, Plane, Polyhedron, Sphere, manifold, signed_distance
 from mathota_jax.collision.pairs import PAIRS as METHODS
 from mathota_jax.collision.pairs import SEARCHED
 from tests.benchmarks.pair_report import run
 from tests.benchmarks.pose_sweep import GATES, gate
-from tests.convex_oracle import CORNERS, KINDS, PAIRS, Placed, Result, oracle, random_scene, rounded
+from tests.convex_oracle import CORNER_FACES, CORNERS, KINDS, PAIRS, Placed, Result, oracle, random_scene, rounded
 from tests.direction_oracle import direction_distance, extent, plane_distance, separation_along
 from tests.polytope_oracle import polytope_distance, polytope_pairs
 from tests.round_oracle import KINDS as ROUND
 from tests.round_oracle import round_distance
 
-CLASSES = {"separated": (1e-2, 1.0), "touching": (-1e-4, 1e-4), "shallow": (-1e-2, -1e-4), "deep": (0.0, 0.0)}
+CLASSES = {
+    "separated": (1e-2, 1.0),
+    "touching": (-1e-4, 1e-4),
+    "shallow": (-1e-2, -1e-4),
+    "deep": (0.0, 0.0),
+    "resting": (-3e-4, 3e-4),
+}
 """Separation [size], uniform between these; deep poses stay where they are drawn."""
+TILT = (-6.0, -1.5)
+"""Faces of resting poses are parallel but for an angle of which the decimal logarithm lies between these."""
 DEEP_REACH = 0.5
 """Largest distance [m] of the centres of deep poses."""
 DOUBTFUL = 0.1
@@ -96,14 +105,17 @@ def exact(pair: tuple[str, str], scene: dict[str, Any]) -> tuple[np.ndarray, np.
     return (polytope_distance if pair in polytope_pairs() else direction_distance)(pair, scene)
 
 
-def draw(pair: tuple[str, str], count: int) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+def draw(
+    pair: tuple[str, str], count: int, classes: Sequence[str] = tuple(CLASSES)
+) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """Poses with the name of the class of each, in equal shares, and the extent [m] of the larger shape of each."""
     rng = np.random.default_rng(count)
     scene: dict[str, Any] = random_scene(pair, count)
-    kinds = np.array(list(CLASSES))[np.arange(count) % len(CLASSES)]
+    kinds = np.array(classes)[np.arange(count) % len(classes)]
     scene["pb"] = np.where(
         (kinds == "deep")[:, None], scene["pa"] + DEEP_REACH / 2 * (scene["pb"] - scene["pa"]), scene["pb"]
     )
+    face_to_face(pair, scene, kinds == "resting", rng)
     extents = [extent(kind, scene[side]) for side, kind in zip("ab", pair, strict=True) if kind != "plane"]
     sizes = np.max(extents, axis=0)
     truths, normals = exact(pair, scene)
@@ -112,6 +124,49 @@ def draw(pair: tuple[str, str], count: int) -> tuple[dict[str, Any], np.ndarray,
     shift = np.where(kinds == "deep", 0.0, gaps - truths)
     scene["pb"] = scene["pb"] + shift[:, None] * normals
     return scene, kinds, sizes
+
+
+def face_to_face(pair: tuple[str, str], scene: dict[str, Any], chosen: np.ndarray, rng: np.random.Generator) -> None:
+    """Turns and places B, in the chosen poses, so that a face, side or end of it lies on one of A, as in a heap."""
+    turn_a, turn_b = (Rotation.from_quat(scene["q" + side][chosen][:, [1, 2, 3, 0]]) for side in "ab")
+    shapes = [{name: value[chosen] for name, value in scene[side].items()} for side in "ab"]
+    up, down = (
+        turn.apply(outward(kind, shape, rng, len(turn)))
+        for turn, kind, shape in zip((turn_a, turn_b), pair, shapes, strict=True)
+    )
+    # Half a turn about the line midway between two directions exchanges them.
+    middle = up - down
+    onto = Rotation.from_rotvec(np.pi * middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    tilt = Rotation.from_rotvec(_directions(rng, len(up)) * 10.0 ** rng.uniform(*TILT, (len(up), 1)))
+    scene["qb"][chosen] = (tilt * onto * turn_b).as_quat()[:, [3, 0, 1, 2]]
+    scene["pb"][chosen] = scene["pa"][chosen] + 2.0 * up + 0.5 * np.cross(up, _directions(rng, len(up)))
+
+
+def outward(kind: str, shape: dict[str, np.ndarray], rng: np.random.Generator, count: int) -> np.ndarray:
+    """Normal of a face or an end, or of a straight side, of each shape (count, 3) in its own frame."""
+    if kind == "plane":
+        return np.tile([0.0, 1.0, 0.0], (count, 1))
+    if kind == "sphere":
+        return _directions(rng, count)
+    if kind == "box":
+        return np.eye(3)[rng.integers(3, size=count)] * rng.choice([-1.0, 1.0], (count, 1))
+    if kind == "polyhedron":
+        faces = CORNER_FACES[rng.integers(len(CORNER_FACES), size=count)]
+        first, second, third = (shape["vertices"][np.arange(count), faces[:, k]] for k in range(3))
+        normal = np.cross(second - first, third - first)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    angle, zero = rng.uniform(0.0, 2.0 * np.pi, count), np.zeros(count)
+    rise = shape["radius"] / np.hypot(shape["radius"], 2.0 * shape["half_height"]) if kind == "cone" else zero
+    across = np.sqrt(1.0 - rise**2)
+    side = np.stack([across * np.cos(angle), rise, across * np.sin(angle)], axis=1)
+    sign = {"capsule": zero, "cone": zero - 1.0}.get(kind, rng.choice([-1.0, 1.0], count))
+    end = np.stack([zero, sign, zero], axis=1)
+    return np.where((rng.random(count) < 0.5)[:, None] & (sign != 0)[:, None], end, side)
+
+
+def _directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    found = rng.normal(size=(count, 3))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def searched(pair: tuple[str, str], scene: dict, precision: str) -> Answer:
@@ -196,7 +251,7 @@ def _compare(
     wrong = ~(np.maximum(separation, normal) <= limit)
     flips = ((result.separation < 0) != (truths < 0)) & (np.abs(truths) > limit * sizes)
     rows = []
-    for kind in CLASSES:
+    for kind in dict.fromkeys(kinds.tolist()):
         chosen = kinds == kind
         rows.append(
             {
@@ -222,10 +277,11 @@ def table(rows: list[dict]) -> str:
     lines = [
         "# Signed distances in many random poses",
         "",
-        "Written by `python -m tests.benchmarks.pose_classes`: a quarter of the poses of each pair separated (0.01 to 1",
-        "size), touching (within 1e-4), shallow (1e-4 to 0.01 deep) and deep (centres within 0.5 m). Answers of",
-        "`signed_distance`; where that has a closed form or its own axes also of the search by support functions; where",
-        "the manifold is found apart from the distance, in float32 also its deepest point.",
+        "Written by `python -m tests.benchmarks.pose_classes`: a fifth of the poses of each pair separated (0.01 to 1",
+        "size), touching (within 1e-4), shallow (1e-4 to 0.01 deep), deep (centres within 0.5 m) and resting (a face, end",
+        "or side parallel to one of the other but for 1e-6 to 0.03 rad, within 3e-4). Answers of `signed_distance`; where",
+        "it has a closed form or its own axes also of the search by support functions; where the manifold is found apart",
+        "from the distance, in float32 also its deepest point.",
         "Truth in float64: closed forms (planes, spheres, capsules), the best of all directions that can separate",
         "(polytopes), else a search of all directions. Where an answer is further from it than a tenth of the gate, cutting",
         "planes with a proof (NNLS, Qhull) decide; *oracle missed* counts where these, or the separation along the engine's",

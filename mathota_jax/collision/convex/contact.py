@@ -108,7 +108,7 @@ def _proved(closest: Closest, upper: Array, tolerance: float) -> Array:
         upper: Upper bound of the separation [size] from the search.
         tolerance: The two count as equal to this share of the size.
     """
-    between = norm(closest.point_b - closest.point_a)
+    between = norm(closest.point_b - closest.point_a) + closest.excess
     upper = jnp.minimum(upper, jnp.where(closest.inside, between, jnp.inf))
     return closest.consistent & (closest.reach >= upper - tolerance)
 

@@ -47,8 +47,8 @@ STIFFNESS_ROUNDING = 64.0
 class Closest(NamedTuple):
     """Unit normal from A to B and the closest points of the cores, in the frame of A, in units of the scale.
 
-    `consistent`: no other piece undercuts the tied ones. `inside`: the points are known to belong to their cores. `reach`:
-    true separation along the normal, a lower bound, not differentiated.
+    `consistent`: no other piece undercuts the tied ones. `inside`: the points are known to belong to their cores, but for
+    `excess` [size]. `reach`: true separation along the normal, a lower bound, not differentiated.
     """
 
     normal: Vec3
@@ -57,6 +57,7 @@ class Closest(NamedTuple):
     ties: Ties
     consistent: Array
     inside: Array
+    excess: Array
     reach: Array
 
 
@@ -107,6 +108,7 @@ def polish(shapes: Difference, simplex: Simplex, solution: Solution) -> Closest:
         ties,
         solution.exact,
         lowest >= -rounding,
+        jnp.zeros_like(solution.separation),
         solution.separation,
     )
     for of_b, kind in enumerate((shapes.kind_a, shapes.kind_b)):
@@ -178,7 +180,8 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
             rounding,
         )
         still = dot(turned, turned) <= rounding * rounding
-        ties = join(state.ties, pieces, weights, ~exact)
+        shares = barycentric([point - extreme for point in points], state.ties.two, state.ties.three)
+        ties = join(state.ties, pieces, weights, shares, ~exact)
         ties, leaves = leave(ties, weights, rounding, exact)
         done = state.done | (exact & still & ~leaves)
         return _Search(state.turn + 1, normal, ties, best, state.left | leaves, done)
@@ -362,6 +365,8 @@ def _flat_end(shapes: Difference, simplex: Simplex, result: Closest, of_b: bool,
     tied = jnp.abs(dot(lax.stop_gradient(normal), offset)) <= TIED * rounding
     tied &= dot(offset, offset) > 4.0 * TIED * rounding
     offset = offset * jnp.where(tied, 1.0, 0.0)
+    # What the search found lies in its shape, but further from the end than the extreme point.
+    excess = jnp.abs(dot(lax.stop_gradient(normal), offset))
     if not of_b:  # carried along by B; A is at rest in its own frame
         offset = shapes.rotation.apply(lax.stop_gradient(shapes.rotation).apply_transposed(offset))
     other = other + offset
@@ -380,6 +385,7 @@ def _flat_end(shapes: Difference, simplex: Simplex, result: Closest, of_b: bool,
         where(chosen, point_b, result.point_b),
         jax.tree.map(lambda new, old: jnp.where(chosen, new, old), single(pieces), result.ties),
         chosen | result.consistent,
-        ~chosen & result.inside,
+        chosen | result.inside,
+        jnp.where(chosen, lax.stop_gradient(excess), result.excess),
         jnp.where(chosen, along, best),
     )

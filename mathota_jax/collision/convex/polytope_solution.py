@@ -14,7 +14,7 @@ from mathota_jax.collision.convex.ties import Ties, distinct, join
 from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Vec3, dot, where
 
-STEPS = 4
+STEPS = 10
 """Most Newton steps; all lanes stop as soon as they have converged."""
 CLEAR = 1e-3
 """Of shapes that are (pulled) apart by this share of the size the search knows the direction to round-off."""
@@ -49,13 +49,17 @@ def solve_polytopes(shapes: Difference, simplex: Simplex) -> Solution:
 
     def advance(state: _Search) -> _Search:
         weights = barycentric(state.points, state.ties.two, state.ties.three)
-        ties = join(state.ties, state.pieces, weights, ~state.exact)
+        from_new = [point - state.extreme for point in state.points]
+        shares = barycentric(from_new, state.ties.two, state.ties.three)
+        ties = join(state.ties, state.pieces, weights, shares, ~state.exact)
         same = [new == old for new, old in zip(ties.pieces, state.ties.pieces, strict=True)]
         points = [where(kept, point, state.extreme) for kept, point in zip(same, state.points, strict=True)]
         normal = compute_once(newton_step(shapes, ties, state.normal, points), state.best.separation)
         extreme, pieces = shapes.least(normal)
         reach = dot(normal, extreme)
         tied = dot(normal, points[0]) <= reach + 4.0 * rounding
+        # Of pieces that tie by less than that a better direction may be known: others are tied there.
+        tied &= reach > state.best.separation - rounding
         best, exact = better(state.best, Solution(normal, reach, ties, tied), True, state.done, rounding)
         return _Search(state.turn + 1, normal, ties, points, extreme, pieces, exact, best, state.done | exact)
 

@@ -46,6 +46,8 @@ while its rounding grows."""
 CLOSE = 1e-3
 """Shapes that are apart by less than this share of the size are searched like overlapping ones if the distance search
 fails to prove its answer; further apart the polish repairs it."""
+LOST = 0.5
+"""So are shapes further apart of which less than this share of the answer is proved: they may overlap."""
 
 
 class _Lifted(NamedTuple):
@@ -81,11 +83,13 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
             reach=jnp.where(lost, axis_separation, found.reach),
         )
         simplex = jax.tree.map(lambda new, old: jnp.where(state.done, old, new), kept, state.simplex)
-        wanted = first & (found.overlap | _stalled(found, tolerance))
-        axis = separating_axis(shapes, a, b, wanted)
+        tested = first & (found.overlap | _stalled(found, tolerance))
+        axis = separating_axis(shapes, a, b, tested)
         # The test knows no axis from a corner: of shapes that are apart it may find less than the search did.
-        wanted &= found.overlap | (axis.separation > found.reach)
-        upper = jnp.where(first, jnp.where(found.overlap, axis.separation, found.distance), state.upper)
+        wanted = tested & (found.overlap | (axis.separation > found.reach))
+        # What no axis parts overlaps, and one of the axes is the direction of its depth.
+        exact = tested & (found.overlap | (axis.separation < 0))
+        upper = jnp.where(first, jnp.where(exact, axis.separation, found.distance), state.upper)
         shift = axis.direction * (LIFT - axis.separation)
         return _Lifted(state.turn + 1, simplex, axis.direction, shift, upper, ~wanted)
 
@@ -101,7 +105,8 @@ def search_polytopes(shapes: Difference, a: Polytope, b: Polytope, tolerance: fl
 
 def _stalled(found: Simplex, tolerance: float) -> Array:
     """Whether the search stalled on a needle of a simplex, close to touch: its direction proves nothing."""
-    return (found.distance < CLOSE) & (found.reach < found.distance - tolerance)
+    allowed = jnp.where(found.distance < CLOSE, found.distance - tolerance, LOST * found.distance)
+    return found.reach < allowed
 
 
 def _no_simplex(zero: Vec3, *, polytopes: bool) -> Simplex:
@@ -148,7 +153,9 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
         least = epa(shapes, solution.normal, cap.half, wanted & ~first & ~cap.whole, PROOF, tolerance)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
         lower = jnp.where(cap.whole, -solution.separation, least.lower)
-        upper = jnp.where(overlap & wanted & ~first, jnp.minimum(upper, -lower), upper)
+        # Shapes that are searched because they all but touch overlap for sure only where a depth is proved.
+        bounded = wanted & ~first & (overlap | (lower >= 0))
+        upper = jnp.where(bounded, jnp.minimum(upper, -lower), upper)
         # A lane keeps the simplex of its seed unless the search found a better direction.
         done = ~wanted | (~first & (cap.whole | (least.depth >= least.seed_depth)))
         start = where(first, seed, least.direction)

@@ -34,11 +34,26 @@ def distinct(pieces: tuple[Array, ...]) -> Ties:
     return Ties((first, second, third), two, two & (third != first) & (third != second))
 
 
-def join(ties: Ties, pieces: Array, weights: Weights, wanted: Array) -> Ties:
-    """Adds a piece pair; of three tied ones it replaces the one of the least weight."""
+def join(ties: Ties, pieces: Array, weights: Weights, shares: Weights, wanted: Array) -> Ties:
+    """Adds a piece pair; of three tied ones it replaces the first to lose all its weight to the new one.
+
+    This is the exchange of the simplex method. Where the least weight decides alone, and the one that has it lies across
+    from the new one, the two replace each other for ever.
+
+    Args:
+        ties: The tied pieces.
+        pieces: The new one.
+        weights: Of the tied points in the point closest to the origin.
+        shares: Of the tied points in the new point.
+        wanted: bool, False where nothing is added.
+    """
     first, second, third = ties.pieces
     wanted = wanted & (pieces != first) & ~(ties.two & (pieces == second)) & ~(ties.three & (pieces == third))
-    slot = jnp.where(ties.three, _lightest(weights), jnp.where(ties.two, 2, 1))
+    lasting = [
+        jnp.where(share > 0, jnp.maximum(weight, 0.0) / jnp.where(share > 0, share, 1.0), jnp.inf)
+        for weight, share in zip(weights, shares, strict=True)
+    ]
+    slot = jnp.where(ties.three, _lightest((lasting[0], lasting[1], lasting[2])), jnp.where(ties.two, 2, 1))
     slot = settle_code(jnp.where(wanted, slot, -1).astype(weights[0].dtype))
     first, second, third = (jnp.where(slot == k, pieces, old) for k, old in enumerate((first, second, third)))
     return Ties((first, second, third), ties.two | (slot == 1), ties.three | (slot == 2))
