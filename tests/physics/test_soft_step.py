@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
+from mathota_jax import Box, Flag, Hinge, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
 from tests.benchmarks.hard_scenes import chain, joint_gaps, overlapping_pyramid
 from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, check
 from tests.gradients.test_bounce_gradient import run as bounce
@@ -203,7 +203,7 @@ def test_overlapping_pyramid_comes_apart_gently(gate):
     speed = np.linalg.norm(record["velocity"][:, 1:], axis=-1)
     gate("largest speed [m/s]", speed, 1.5 * PUSH_OUT + np.sqrt(2 * GRAVITY * 3.25))
     gate("speed at the end [m/s]", speed[-1], 0.05)
-    assert int(final.flags) == 0
+    assert not int(final.flags) & ~Flag.DEEP_OVERLAP  # the cubes overlap by the share at which it begins
 
 
 @pytest.mark.slow

@@ -203,6 +203,23 @@ def test_overflow_keeps_the_deepest_and_is_flagged(method, scene, precision):
     np.testing.assert_array_equal(pairs.overflow, [len(e) > capacity for e in expected])
 
 
+@pytest.mark.parametrize("count", [3, 9, 27, 200])
+def test_the_deepest_by_digits_of_the_width_that_suits_a_number_of_shapes(count):
+    """The tail digit of a depth, and digits that reach beyond the sign of an int32, are where it could go wrong."""
+    rng = np.random.default_rng(count)
+    center, half = cloud(rng, count, 1.0, (2.0, 3.0))
+    half = half * np.where(rng.uniform(size=(WORLDS, count, 1)) < 0.2, 1e-20, 1.0)
+    half[0] *= 1e25
+    bounds, admissible = bounds_of(center, half, np.float32), everything(count)
+    expected = brute_force(bounds, admissible)
+    capacity = len(expected[1]) // 2 + 1
+    pairs = compiled("all_pairs", bounds, admissible, capacity)
+    for world, depth in enumerate(expected):
+        ranked = sorted(depth, key=lambda pair, depth=depth: (-np.float32(depth[pair]), pair))
+        assert len(ranked) > 1
+        assert listed(pairs, world) == sorted(ranked[:capacity])
+
+
 @pytest.mark.parametrize("method", BROADPHASES)
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)

@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from mathota_jax.collision.convex.difference import difference
 from mathota_jax.collision.convex.polytope import POLYTOPES, polytope
-from mathota_jax.collision.convex.separating_axis import LANES, separating_axis
+from mathota_jax.collision.convex.separating_axis import separating_axis
 from mathota_jax.collision.polyhedron import edge_table
 from mathota_jax.geometry.hull import convex_hull, padded_faces
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
+from mathota_jax.spatial.wanted import LANES
 from tests.convex_oracle import Placed, oracle, random_scene, rounded, to_engine, with_faces
 from tests.marks import QUICK_IN_FLOAT64
 

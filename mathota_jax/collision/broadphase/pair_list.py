@@ -173,7 +173,7 @@ def collect(
     if capacity < count * (count - 1) // 2:
         keys = jax.lax.cond(
             (total > capacity).any(),
-            lambda _: fill(_deepest(enumerators, hits, capacity, worlds))[0],
+            lambda _: fill(_deepest(enumerators, hits, capacity, worlds, _digit_bits(count)))[0],
             lambda keys: keys,
             keys,
         )
@@ -218,30 +218,40 @@ def _shallowness(depth: Array) -> Array:
     return jnp.iinfo(jnp.int32).max - code
 
 
-DIGIT_BITS = 11
-DIGITS = 3
-"""Digits of a non-negative int32."""
+CODE_BITS = 31
+"""Of a non-negative int32."""
 
 
-def _deepest(enumerators: Sequence[Enumerate], hits: Callable, capacity: int, worlds: int) -> tuple[Array, Array]:
+def _digit_bits(count: int) -> int:
+    """Bits of a digit for which the selection among the pairs of `count` shapes takes the fewest operations.
+
+    Each digit costs a visit of all pairs and running sums of the histogram, by doubling.
+    """
+    pair_count = count * (count - 1) // 2
+    return min(range(3, 12), key=lambda bits: -(-CODE_BITS // bits) * (pair_count + (bits + 2) * 2**bits))
+
+
+def _deepest(
+    enumerators: Sequence[Enumerate], hits: Callable, capacity: int, worlds: int, digit_bits: int
+) -> tuple[Array, Array]:
     """Largest (shallowness, key) among the `capacity` smallest, by radix selection: a histogram for each digit.
 
     Ties in depth go to the smaller key, so that every method keeps the same pairs.
     """
-    bin_count = 1 << DIGIT_BITS
+    bin_count, digits = 1 << digit_bits, -(-CODE_BITS // digit_bits)
 
     def select_digit(turn: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         """Appends one digit: those of the shallowness first, then those of the key among equally deep pairs."""
         limit, key_limit, room = state
-        ties = turn >= DIGITS
-        shift = DIGIT_BITS * (DIGITS - 1 - turn % DIGITS)
+        ties = turn >= digits
+        shift = digit_bits * (digits - 1 - turn % digits)
         prefix = jnp.where(ties, key_limit, limit)
 
         def visit(histogram: tuple, first: Array, second: Array, kept: Array, known: Array | None = None) -> tuple:
             hit, key, depth = hits(first, second, kept, known)
             shallowness = _shallowness(depth)
             code = jnp.where(ties, key, shallowness)
-            hit = hit & (~ties | (shallowness == limit)) & ((code >> shift >> DIGIT_BITS) == prefix)
+            hit = hit & (~ties | (shallowness == limit)) & ((code >> shift >> digit_bits) == prefix)
             digit = jnp.where(hit, (code >> shift) & (bin_count - 1), bin_count)
             return (histogram[0].at[digit, jnp.arange(worlds)].add(1, mode="drop"),)
 
@@ -252,10 +262,10 @@ def _deepest(enumerators: Sequence[Enumerate], hits: Callable, capacity: int, wo
         # The digit in which the last place falls; what has a smaller digit is kept whole. The last digit if all fit.
         digit = jnp.minimum((counts < room).sum(0, dtype=jnp.int32), bin_count - 1)
         before = jnp.where(jnp.arange(bin_count)[:, None] < digit, histogram[0], 0).sum(0, dtype=jnp.int32)
-        prefix = (prefix << DIGIT_BITS) + digit
+        prefix = (prefix << digit_bits) + digit
         return jnp.where(ties, limit, prefix), jnp.where(ties, prefix, key_limit), room - before
 
     zero = jnp.zeros(worlds, jnp.int32)
     room = jnp.full(worlds, capacity, jnp.int32)
-    limit, key_limit, _ = jax.lax.fori_loop(0, 2 * DIGITS, select_digit, (zero, zero, room))
+    limit, key_limit, _ = jax.lax.fori_loop(0, 2 * digits, select_digit, (zero, zero, room))
     return limit, key_limit

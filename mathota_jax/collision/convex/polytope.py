@@ -24,6 +24,8 @@ BOX_FACES = np.array([(1, 3, 7, 5), (0, 4, 6, 2), (2, 6, 7, 3), (0, 1, 5, 4), (4
 SIDEWAYS = AXES[[0, 5, 1, 4]]
 """Normals of a segment along y, in the order in which its four arcs follow each other about +y."""
 
+Edges = np.ndarray | Array
+
 
 class Polytope(NamedTuple):
     """A convex polytope in its own frame.
@@ -38,8 +40,19 @@ class Polytope(NamedTuple):
 
     vertices: Vec3
     normals: Vec3
-    edges: np.ndarray | None
+    edges: Edges | None
     row: Array | None = None
+
+    def without_edges(self) -> tuple[Polytope, Edges | None]:
+        """The polytope as arrays ``(..., pair, world)`` only, and the table of its edges, of which it has the rows."""
+        row = self.row
+        if row is None and self.edges is not None and self.edges.shape[-1] > 1:
+            row = jnp.arange(self.edges.shape[-1], dtype=jnp.int32)[:, None]
+        return self._replace(edges=None, row=row), self.edges
+
+    def with_edges(self, edges: Edges | None) -> Polytope:
+        """Any of the pairs of a polytope without edges, with the table of their edges."""
+        return self._replace(edges=edges)
 
 
 def polytope(kind: str, shape: dict[str, Any]) -> Polytope:

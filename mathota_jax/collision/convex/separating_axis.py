@@ -19,18 +19,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.difference import Difference
 from mathota_jax.collision.convex.polytope import Polytope
 from mathota_jax.spatial.indexing import gather, unstack
-from mathota_jax.spatial.settle import compute_once, materialize, settle_code, store
+from mathota_jax.spatial.settle import compute_once, settle_code, store
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, normalize, where
+from mathota_jax.spatial.wanted import of_wanted
 
-LANES = 256
-"""Pairs that are tested at a time: what is known of them stays in the cache beside the core."""
 EDGES = 4
 """Edges of each shape that are tested against each other at a time."""
 BITS = 24
@@ -51,7 +49,10 @@ class Axis(NamedTuple):
 
 
 class _Placed(NamedTuple):
-    """Polytopes with components (row, lane), B's in its own frame, and its pose in the frame of A."""
+    """Polytopes with components (row, lane), B's in its own frame, and its pose in the frame of A.
+
+    Their edges are (4, edge, lane or 1).
+    """
 
     a: Polytope
     b: Polytope
@@ -69,84 +70,38 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
         wanted: bool ``(pair, world)``, False where the result is not needed. Those pairs cost next to nothing.
 
     Returns:
-        The axis, in the frame of A; anything finite where it is not wanted.
+        The axis, in the frame of A; zeros where it is not wanted.
     """
-    placed = _Placed(a, b, shapes.rotation, shapes.position)
+    (a, edges_a), (b, edges_b) = a.without_edges(), b.without_edges()
+
+    def best(values: tuple[Polytope, Polytope, Mat3, Vec3]) -> Axis:
+        a, b, rotation, position = values
+        shape = position.x.shape
+        a, b = _of_lanes(a.with_edges(edges_a), shape), _of_lanes(b.with_edges(edges_b), shape)
+        rotation, position = jax.tree.map(lambda c: _flat(c, shape), (rotation, position))
+        axis = _best(_Placed(a, b, rotation, position))
+        return jax.tree.map(lambda c: c.reshape(shape), axis)
+
     none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
-    return lax.cond(jnp.any(wanted), lambda: _best_of_wanted(wanted, placed), lambda: none)
+    return of_wanted(best, wanted, (a, b, shapes.rotation, shapes.position), none)
 
 
-def _best_of_wanted(wanted: Array, placed: _Placed) -> Axis:
-    """`_best` of the pairs that are wanted, `LANES` at a time."""
-    lanes = min(LANES, wanted.size)
-    edges, rows = (placed.a.edges, placed.b.edges), (placed.a.row, placed.b.row)
-    placed = placed._replace(a=_without_edges(placed.a), b=_without_edges(placed.b))
-    place = jnp.cumsum(wanted.reshape(-1), dtype=jnp.int32)
-    count = place[-1]
-    order = jnp.zeros(wanted.size, jnp.int32)
-    order = order.at[jnp.where(wanted.reshape(-1), place - 1, wanted.size)].set(
-        jnp.arange(wanted.size, dtype=jnp.int32), mode="drop"
-    )
-    shared, by_pair, by_lane = _tables(placed, wanted.shape)
-
-    def test_some(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        turn, found = state
-        chosen = lax.dynamic_slice_in_dim(order, turn * lanes, lanes)
-        leaves = list(shared)
-        for tables, index in ((by_pair, chosen // wanted.shape[1]), (by_lane, chosen)):
-            for places, table in tables:
-                some = jnp.take(table, index, axis=-1)
-                for at, leaf in zip(places, unstack(some, 0), strict=True):
-                    leaves[at] = leaf
-        some = _with_edges(jax.tree.unflatten(jax.tree.structure(placed), leaves), edges, rows, chosen, wanted.shape)
-        axis = materialize(_best(some))
-        return turn + 1, found.at[:, chosen].set(jnp.stack([*axis.direction, axis.separation]))
-
-    state = jnp.zeros((), jnp.int32), jnp.zeros((4, wanted.size), placed.position.x.dtype)
-    _, found = lax.while_loop(lambda s: s[0] * lanes < count, test_some, state)
-    x, y, z, separation = (row.reshape(wanted.shape) for row in unstack(found, 0))
-    return Axis(Vec3(x, y, z), separation)
+def _of_lanes(polytope: Polytope, shape: tuple[int, ...]) -> Polytope:
+    """A polytope with components (row, lane or 1), as are its edges."""
+    edges = polytope.edges
+    if edges is not None:
+        edges = jnp.asarray(edges)
+        if polytope.row is not None:
+            edges = jnp.take(edges, _flat(polytope.row, shape), axis=-1, mode="clip")
+    vertices, normals = jax.tree.map(lambda c: _flat(c, shape), (polytope.vertices, polytope.normals))
+    return Polytope(vertices, normals, edges)
 
 
-_Tables = list[tuple[list[int], Array]]
-
-
-def _tables(placed: _Placed, shape: tuple[int, ...]) -> tuple[list[Array], _Tables, _Tables]:
-    """Leaves that all pairs share, (..., 1), the others stacked with their numbers: those of one shape in a table.
-
-    A table is (leaf, ..., pair), or (leaf, ..., lane) where worlds differ.
-    """
-    leaves = jax.tree.leaves(placed)
-    by_pair, by_lane = [], []
-    for size in dict.fromkeys(leaf.shape for leaf in leaves if leaf.shape[-2:] != (1, 1)):
-        places = [place for place, leaf in enumerate(leaves) if leaf.shape == size]
-        stacked = jnp.stack([leaves[place] for place in places])
-        if size[-1] == 1:
-            by_pair.append((places, stacked[..., 0]))
-        else:
-            stacked = jnp.broadcast_to(stacked, (*stacked.shape[:-2], *shape))
-            by_lane.append((places, stacked.reshape(*stacked.shape[:-2], -1)))
-    return [leaf[..., 0] for leaf in leaves], by_pair, by_lane
-
-
-def _without_edges(polytope: Polytope) -> Polytope:
-    return polytope._replace(edges=None, row=None)
-
-
-def _with_edges(placed: _Placed, edges: Sequence, rows: Sequence, chosen: Array, shape: tuple[int, ...]) -> _Placed:
-    """Both polytopes of the chosen lanes with their edges (4, edge, lane or 1)."""
-
-    def of_lanes(edges: np.ndarray | None, row: Array | None) -> Array | None:
-        if edges is None:
-            return None
-        table = jnp.asarray(edges)
-        if table.shape[-1] == 1:
-            return table
-        row = chosen // shape[1] if row is None else jnp.broadcast_to(row, shape).reshape(-1)[chosen]
-        return jnp.take(table, row, axis=-1, mode="clip")
-
-    edges_a, edges_b = (of_lanes(*both) for both in zip(edges, rows, strict=True))
-    return placed._replace(a=placed.a._replace(edges=edges_a), b=placed.b._replace(edges=edges_b))
+def _flat(values: Array, shape: tuple[int, ...]) -> Array:
+    """Values (..., pair, world) as (..., lane), or (..., 1) where all pairs share them."""
+    if values.shape[-2:] == (1, 1):
+        return values[..., 0]
+    return jnp.broadcast_to(values, (*values.shape[:-2], *shape)).reshape(*values.shape[:-2], -1)
 
 
 def _best(placed: _Placed) -> Axis:
