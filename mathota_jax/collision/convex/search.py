@@ -18,7 +18,7 @@ from jax import Array, lax
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.cap import proved_cap
 from mathota_jax.collision.convex.difference import Difference
-from mathota_jax.collision.convex.epa import epa
+from mathota_jax.collision.convex.epa import Penetration, epa
 from mathota_jax.collision.convex.gjk import Simplex, gjk
 from mathota_jax.collision.convex.polish import Solution, solve
 from mathota_jax.collision.convex.polytope import Polytope
@@ -26,6 +26,7 @@ from mathota_jax.collision.convex.separating_axis import separating_axis
 from mathota_jax.collision.convex.support import SUPPORT, Parameters
 from mathota_jax.collision.convex.ties import Ties
 from mathota_jax.spatial.vector import Vec3, dot, where
+from mathota_jax.spatial.wanted import of_wanted
 
 POLYTOPE_ITERATIONS = 16
 CURVED_ITERATIONS = {"float32": 24, "float64": 40}
@@ -140,6 +141,10 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
     """
     number = shapes.position.x.dtype
 
+    def prove(values: tuple[Difference, Vec3, Array, Array]) -> Penetration:
+        shapes, seed, half_proved, unproved = values
+        return epa(shapes, seed, half_proved, unproved, PROOF, tolerance)
+
     def turn(state: _Search) -> _Search:
         found = gjk(shapes, state.start, state.shift, ~state.done, CURVED_ITERATIONS[str(number)])
         first = state.turn == 0
@@ -150,7 +155,9 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
         overlap = jnp.where(first, found.overlap, state.overlap)
         wanted = jnp.where(first, found.overlap | _stalled(found, tolerance), ~state.done)
         cap = proved_cap(shapes, solution, tolerance)
-        least = epa(shapes, solution.normal, cap.half, wanted & ~first & ~cap.whole, PROOF, tolerance)
+        unproved = wanted & ~first & ~cap.whole
+        nothing = Penetration(vector, zero, zero, zero)
+        least = of_wanted(prove, unproved, (shapes, solution.normal, cap.half, unproved), nothing)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
         lower = jnp.where(cap.whole, -solution.separation, least.lower)
         # Shapes that are searched because they all but touch overlap for sure only where a depth is proved.
