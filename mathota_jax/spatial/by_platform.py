@@ -9,7 +9,7 @@ import jax
 from jax import Array
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.interpreters import mlir
+from jax.interpreters import batching, mlir
 
 GPU = "cuda"
 """The platform with a way of its own."""
@@ -29,31 +29,46 @@ def by_platform(anywhere: Callable[..., Any], on_gpu: Callable[..., Any], result
     """
     leaves, in_tree = jax.tree.flatten(args)
     expected, out_tree = jax.tree.flatten(result)
+
+    def of_leaves(function: Callable[..., Any]) -> Callable[..., list[Array]]:
+        return lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(in_tree, leaves)))
+
     found = _by_platform_p.bind(
         *leaves,
-        anywhere=anywhere,
-        on_gpu=on_gpu,
-        in_tree=in_tree,
+        anywhere=of_leaves(anywhere),
+        on_gpu=of_leaves(on_gpu),
         shapes=tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in expected),
     )
     return jax.tree.unflatten(out_tree, found)
 
 
-def _run(function: Callable[..., Any], in_tree: Any, leaves: tuple[Array, ...]) -> list[Array]:
-    return jax.tree.leaves(function(*jax.tree.unflatten(in_tree, leaves)))
+def _anywhere(*leaves: Array, anywhere: Callable[..., list[Array]], **_: Any) -> list[Array]:
+    return anywhere(*leaves)
 
 
-def _anywhere(*leaves: Array, anywhere: Callable[..., Any], in_tree: Any, **_: Any) -> list[Array]:
-    return _run(anywhere, in_tree, leaves)
+def _on_gpu(*leaves: Array, on_gpu: Callable[..., list[Array]], **_: Any) -> list[Array]:
+    return on_gpu(*leaves)
 
 
-def _on_gpu(*leaves: Array, on_gpu: Callable[..., Any], in_tree: Any, **_: Any) -> list[Array]:
-    return _run(on_gpu, in_tree, leaves)
+def _batched(
+    leaves: tuple[Array, ...],
+    axes: tuple[int | None, ...],
+    *,
+    anywhere: Callable[..., list[Array]],
+    on_gpu: Callable[..., list[Array]],
+    shapes: tuple[jax.ShapeDtypeStruct, ...],
+) -> tuple[list[Array], list[int]]:
+    size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+    ways = (jax.vmap(way, axes, axis_size=size) for way in (anywhere, on_gpu))
+    results = tuple(jax.ShapeDtypeStruct((size, *shape.shape), shape.dtype) for shape in shapes)
+    found = _by_platform_p.bind(*leaves, **dict(zip(("anywhere", "on_gpu"), ways, strict=True)), shapes=results)
+    return found, [0] * len(found)
 
 
 _by_platform_p = Primitive("by_platform")
 _by_platform_p.multiple_results = True
 _by_platform_p.def_abstract_eval(lambda *_, shapes, **__: [ShapedArray(x.shape, x.dtype) for x in shapes])
 _by_platform_p.def_impl(_anywhere)
+batching.primitive_batchers[_by_platform_p] = _batched
 mlir.register_lowering(_by_platform_p, mlir.lower_fun(_anywhere, multiple_results=True))
 mlir.register_lowering(_by_platform_p, mlir.lower_fun(_on_gpu, multiple_results=True), platform=GPU)

@@ -32,6 +32,7 @@ def of_wanted(function: Function, wanted: Array, values: Any, otherwise: Any) ->
         values: Pytree of arrays ``(..., pair, world)``; either of the last axes may be 1.
         otherwise: Pytree of arrays ``(pair, world)``.
     """
+    wanted, values, otherwise = lax.stop_gradient((wanted, values, otherwise))
     leaves, structure = jax.tree.flatten(values)
     # An array that is there twice is one to copy.
     different = list({id(leaf): leaf for leaf in leaves}.values())

@@ -1,12 +1,17 @@
 """A function of some of many pairs: the same numbers, whichever way it is computed, and nothing else is touched."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mathota_jax import Cylinder, Options, Polyhedron, SceneBuilder, step
 from mathota_jax.spatial import wanted as module
 from mathota_jax.spatial.wanted import LANES, of_wanted
+
+CUBE = Polyhedron(np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]))
 
 
 def mixed(values):
@@ -41,3 +46,28 @@ def test_every_wanted_pair_and_no_other(pairs, worlds, share, float64):
             expected = np.where(wanted, truth, otherwise[name])
             np.testing.assert_allclose(way[name], expected, rtol=1e-15, atol=1e-15)
             assert way[name].dtype == otherwise[name].dtype
+
+
+def test_batches_of_tables(float64):
+    """As where chunks of a list are worked on at once."""
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(3, 4, 50))
+    wanted = rng.uniform(size=values.shape) < 0.3
+    found = jax.jit(jax.vmap(lambda w, v: of_wanted(jnp.exp, w, v, v)))(wanted, values)
+    np.testing.assert_allclose(found, np.where(wanted, np.exp(values), values), rtol=1e-15)
+
+
+@pytest.mark.parametrize("shape", [CUBE, Cylinder(0.5, 0.5)], ids=["hulls", "cylinders"])
+def test_programs_for_gpus(shape):
+    """Close pairs are worked on at once there, chunks of them side by side; forwards and with derivatives."""
+    builder = SceneBuilder()
+    for k in range(3):
+        builder.add_body(shape, mass=1.0, position=(0, 0.9 * k, 0))
+    model, state = builder.build(Options(broadphase="all_pairs"))
+
+    def heights(speed):
+        return step(model, dataclasses.replace(state, velocity=state.velocity + speed)).position[:, 1].sum()
+
+    for program in (heights, jax.grad(heights)):
+        text = jax.jit(program).trace(0.0).lower(lowering_platforms=("cuda",)).as_text()
+        assert "optimization_barrier" in text
