@@ -13,6 +13,7 @@ from mathota_jax.collision.convex.polytope import POLYTOPES, polytope
 from mathota_jax.collision.convex.separating_axis import separating_axis
 from mathota_jax.collision.polyhedron import edge_table
 from mathota_jax.geometry.hull import convex_hull, padded_faces
+from mathota_jax.spatial import wanted as some_of_many
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3, cross, dot, norm
@@ -51,6 +52,20 @@ def test_depth_of_overlapping_cores_against_the_oracle(pair, precision):
             assert separation[index] == pytest.approx(truth, abs=2e-6 if precision == np.float32 else 1e-9)
             compared += 1
     assert compared > 10
+
+
+def test_all_pairs_at_once_as_on_gpus(monkeypatch, float64):
+    """The same axes, of shapes of which half are so far apart that they would test every edge."""
+    pair, count = ("polyhedron", "polyhedron"), LANES + 7
+    scene = random_scene(pair, count, reach=0.3)
+    scene["pb"][::2] *= 100.0
+    arguments = pair, jnp.asarray(np.arange(count)[None] % 2 == 1), *to_engine(scene, np.float64)
+    in_turns, _ = axis(*arguments)
+    monkeypatch.setattr(some_of_many, "by_platform", lambda anywhere, on_gpu, result, *args: on_gpu(*args))
+    at_once, _ = jax.jit(axis.__wrapped__, static_argnames="pair")(*arguments)
+    assert (in_turns.separation < 0).sum() > count // 4
+    for one, other in zip(jax.tree.leaves(in_turns), jax.tree.leaves(at_once), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-14)
 
 
 def pose(offset, turn=(0, 0, 0)):

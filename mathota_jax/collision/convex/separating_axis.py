@@ -74,16 +74,16 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
     """
     (a, edges_a), (b, edges_b) = a.without_edges(), b.without_edges()
 
-    def best(values: tuple[Polytope, Polytope, Mat3, Vec3]) -> Axis:
-        a, b, rotation, position = values
+    def best(values: tuple[Polytope, Polytope, Mat3, Vec3, Array]) -> Axis:
+        a, b, rotation, position, wanted = values
         shape = position.x.shape
         a, b = _of_lanes(a.with_edges(edges_a), shape), _of_lanes(b.with_edges(edges_b), shape)
-        rotation, position = jax.tree.map(lambda c: _flat(c, shape), (rotation, position))
-        axis = _best(_Placed(a, b, rotation, position))
+        rotation, position, wanted = jax.tree.map(lambda c: _flat(c, shape), (rotation, position, wanted))
+        axis = _best(_Placed(a, b, rotation, position), wanted)
         return jax.tree.map(lambda c: c.reshape(shape), axis)
 
     none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
-    return of_wanted(best, wanted, (a, b, shapes.rotation, shapes.position), none)
+    return of_wanted(best, wanted, (a, b, shapes.rotation, shapes.position, wanted), none)
 
 
 def _of_lanes(polytope: Polytope, shape: tuple[int, ...]) -> Polytope:
@@ -104,8 +104,8 @@ def _flat(values: Array, shape: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(values, (*values.shape[:-2], *shape)).reshape(*values.shape[:-2], -1)
 
 
-def _best(placed: _Placed) -> Axis:
-    """`separating_axis` of all lanes."""
+def _best(placed: _Placed, wanted: Array) -> Axis:
+    """`separating_axis` of all lanes; of those that are not wanted (lane,) among the faces alone."""
     a, b, rotation, position = placed
     number = position.x.dtype
     normals_b = compute_once(rotation.apply(b.normals), position.x)
@@ -118,7 +118,7 @@ def _best(placed: _Placed) -> Axis:
     if a.edges is None or b.edges is None:
         return Axis(direction, best)
     depth = jnp.maximum(-best, 0.0) - DEPTH_ROUNDING * float(jnp.finfo(number).eps)
-    crossed = _best_crossing(placed, _untested(of_a, depth, a.edges), _untested(of_b, depth, b.edges))
+    crossed = _best_crossing(placed, _untested(of_a, depth, a.edges), _untested(of_b, depth, b.edges), wanted)
     by_edges = settle_code((crossed.separation > best).astype(number)) == 1
     return Axis(where(by_edges, crossed.direction, direction), jnp.where(by_edges, crossed.separation, best))
 
@@ -235,13 +235,14 @@ class _Search(NamedTuple):
     pair: tuple[Array, Array]
 
 
-def _best_crossing(placed: _Placed, left_a: Set, left_b: Set) -> Axis:
+def _best_crossing(placed: _Placed, left_a: Set, left_b: Set, wanted: Array) -> Axis:
     """Best direction across an edge of A and one of B; the separation is the lowest number if no arcs cross.
 
     Args:
         placed: The polytopes.
         left_a: Edges of A that are tested.
         left_b: Edges of B that are tested.
+        wanted: Lanes whose result is needed. Shapes that are far apart would test every edge.
     """
 
     def turned(edges: _Edges) -> _Edges:
@@ -272,7 +273,7 @@ def _best_crossing(placed: _Placed, left_a: Set, left_b: Set) -> Axis:
     (numbers_a, rest_a), (numbers_b, rest_b) = _lowest(left_a), _lowest(left_b)
     lowest = jnp.full_like(placed.position.x, jnp.finfo(placed.position.x.dtype).min)
     first = numbers_a[0], numbers_b[0]
-    busy = ~_is_empty(left_a) & ~_is_empty(left_b)
+    busy = wanted & ~_is_empty(left_a) & ~_is_empty(left_b)
     state = _Search((rest_a, rest_b), (numbers_a, numbers_b), busy, lowest, first)
     state = lax.while_loop(lambda s: jnp.any(s.busy), test, state)
     edge_a, edge_b = (
