@@ -59,9 +59,9 @@ def _batched(
     shapes: tuple[jax.ShapeDtypeStruct, ...],
 ) -> tuple[list[Array], list[int]]:
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
-    ways = (jax.vmap(way, axes, axis_size=size) for way in (anywhere, on_gpu))
+    anywhere, on_gpu = (jax.vmap(way, axes, axis_size=size) for way in (anywhere, on_gpu))
     results = tuple(jax.ShapeDtypeStruct((size, *shape.shape), shape.dtype) for shape in shapes)
-    found = _by_platform_p.bind(*leaves, **dict(zip(("anywhere", "on_gpu"), ways, strict=True)), shapes=results)
+    found = _by_platform_p.bind(*leaves, anywhere=anywhere, on_gpu=on_gpu, shapes=results)
     return found, [0] * len(found)
 
 
