@@ -57,7 +57,9 @@ def test_batches_of_tables(float64):
     np.testing.assert_allclose(found, np.where(wanted, np.exp(values), values), rtol=1e-15)
 
 
-@pytest.mark.parametrize("shape", [CUBE, Cylinder(0.5, 0.5)], ids=["hulls", "cylinders"])
+@pytest.mark.parametrize(
+    "shape", [pytest.param(CUBE, id="hulls"), pytest.param(Cylinder(0.5, 0.5), id="cylinders", marks=pytest.mark.slow)]
+)
 def test_programs_for_gpus(shape):
     """Close pairs are worked on at once there, chunks of them side by side; forwards and with derivatives."""
     builder = SceneBuilder()
