@@ -12,7 +12,7 @@ LIMITS = {
     "worlds search and clipping are 65 % of a step, in some 1600 kernels of one to four microseconds: 15 iterations of GJK "
     "of some 40 kernels each, the exact axes (12 %), faces and their clipping (15 %). Sweeps over them one after the other "
     "take 6 %. Reductions over 3 to 12 rows without the library that XLA hands them to gained 6 %, room for nine pairs "
-    "instead of 16 another fifth. After this measurement tables of what overlaps, whose worlds lie side by side, made a step "
-    "1.24 times as fast (interleaved); on the slower machine of 29 November that is 29.8 k/s, 1.47 times MuJoCo's default "
-    "there. Worlds that differ, as these do not, fill more chunks of the list of pairs: up to a third slower",
+    "instead of 16 another fifth. After this measurement tables of what overlaps, whose worlds lie side by side, made a "
+    "step 1.24 times as fast (interleaved); on the slower machine of 29 November that is 29.8 k/s, 1.47 times MuJoCo's "
+    "default there. Worlds that differ, as these do not, fill more chunks of the list of pairs: up to a third slower",
 }
