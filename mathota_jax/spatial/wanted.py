@@ -16,7 +16,7 @@ from mathota_jax.spatial.settle import compute_once, materialize
 LANES = 128
 """Pairs at a time: what is known of them stays in the cache beside the core."""
 
-Function = Callable[[Any], Any]
+Function = Callable[[Any, Array], Any]
 
 
 def of_wanted(function: Function, wanted: Array, values: Any, otherwise: Any) -> Any:
@@ -26,46 +26,39 @@ def of_wanted(function: Function, wanted: Array, values: Any, otherwise: Any) ->
     the device, take longer.
 
     Args:
-        function: Its argument is like `values`, of some pairs ``(1, lane)``; its result like `otherwise`, of those. It
-            closes over no traced array.
+        function: Its arguments are like `values` and `wanted`, of some pairs ``(1, lane)``; its result like `otherwise`, of
+            those. It closes over no traced array. Of pairs that are not wanted any result will do.
         wanted: bool ``(pair, world)``.
         values: Pytree of arrays ``(..., pair, world)``; either of the last axes may be 1.
         otherwise: Pytree of arrays ``(pair, world)``.
     """
+
+    def on_cpu(wanted: Array, values: Any, otherwise: Any) -> Any:
+        return _if_any(wanted, otherwise, lambda: _in_turns(function, wanted, values, otherwise))
+
+    def on_gpu(wanted: Array, values: Any, otherwise: Any) -> Any:
+        return _if_any(wanted, otherwise, lambda: _at_once(function, wanted, values, otherwise))
+
     wanted, values, otherwise = lax.stop_gradient((wanted, values, otherwise))
-    leaves, structure = jax.tree.flatten(values)
-    # An array that is there twice is one to copy.
-    different = list({id(leaf): leaf for leaf in leaves}.values())
-    place_of = {id(leaf): place for place, leaf in enumerate(different)}
-    places = [place_of[id(leaf)] for leaf in leaves]
-
-    def of_leaves(leaves: list[Array]) -> Any:
-        return function(jax.tree.unflatten(structure, [leaves[place] for place in places]))
-
-    def on_cpu(wanted: Array, leaves: list[Array], otherwise: Any) -> Any:
-        return _if_any(wanted, otherwise, lambda: _in_turns(of_leaves, wanted, leaves, otherwise))
-
-    def on_gpu(wanted: Array, leaves: list[Array], otherwise: Any) -> Any:
-        return _if_any(wanted, otherwise, lambda: _at_once(of_leaves, wanted, leaves, otherwise))
-
-    return by_platform(on_cpu, on_gpu, otherwise, wanted, different, otherwise)
+    return by_platform(on_cpu, on_gpu, otherwise, wanted, values, otherwise)
 
 
 def _if_any(wanted: Array, otherwise: Any, compute: Callable[[], Any]) -> Any:
     return lax.cond(jnp.any(wanted), compute, lambda: otherwise)
 
 
-def _at_once(function: Function, wanted: Array, leaves: list[Array], otherwise: Any) -> Any:
-    return jax.tree.map(lambda new, old: jnp.where(wanted, new, old), function(leaves), otherwise)
+def _at_once(function: Function, wanted: Array, values: Any, otherwise: Any) -> Any:
+    return jax.tree.map(lambda new, old: jnp.where(wanted, new, old), function(values, wanted), otherwise)
 
 
-def _in_turns(function: Function, wanted: Array, leaves: list[Array], otherwise: Any) -> Any:
+def _in_turns(function: Function, wanted: Array, values: Any, otherwise: Any) -> Any:
     size = wanted.size
     lanes = min(LANES, size)
     place = jnp.cumsum(wanted.reshape(-1), dtype=jnp.int32)
     count = place[-1]
     order = jnp.full(size, size, jnp.int32)
     order = order.at[jnp.where(wanted.reshape(-1), place - 1, size)].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
+    leaves, structure = jax.tree.flatten(values)
     tables = _tables(leaves, wanted.shape)
     known, result = jax.tree.flatten(otherwise)
     groups = _groups(known)
@@ -81,7 +74,7 @@ def _in_turns(function: Function, wanted: Array, leaves: list[Array], otherwise:
             # Stored: the gather leaves lane by lane, and each kernel that reads it would turn it round for itself.
             for at, leaf in zip(places, unstack(compute_once(taken, taken), 0), strict=True):
                 of_lanes[at] = leaf[..., None, :]
-        computed = jax.tree.leaves(function(of_lanes))
+        computed = jax.tree.leaves(function(jax.tree.unflatten(structure, of_lanes), jnp.ones((1, lanes), bool)))
         rows = [jnp.stack(materialize(_numbers(computed, places))) for places in groups]
         return turn + 1, [old.at[:, chosen].set(new, mode="drop") for old, new in zip(found, rows, strict=True)]
 

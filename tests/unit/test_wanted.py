@@ -10,11 +10,12 @@ import pytest
 from mathota_jax import Cylinder, Options, Polyhedron, SceneBuilder, step
 from mathota_jax.spatial import wanted as module
 from mathota_jax.spatial.wanted import LANES, of_wanted
+from tests.hulls import BOX_CORNERS
 
-CUBE = Polyhedron(np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]))
+CUBE = Polyhedron(0.5 * BOX_CORNERS)
 
 
-def mixed(values):
+def mixed(values, _):
     """Of numbers of every kind, some of which pairs, worlds or all share."""
     own, of_pair, of_world, of_all, code = values
     total = own + of_pair[0] + of_pair[1] * of_all
@@ -41,7 +42,7 @@ def test_every_wanted_pair_and_no_other(pairs, worlds, share, float64):
     }
     found = jax.jit(lambda *args: of_wanted(mixed, *args))(wanted, values, otherwise)
     at_once = module._at_once(mixed, wanted, values, otherwise)
-    for name, truth in mixed(values).items():
+    for name, truth in mixed(values, wanted).items():
         for way in (found, at_once):
             expected = np.where(wanted, truth, otherwise[name])
             np.testing.assert_allclose(way[name], expected, rtol=1e-15, atol=1e-15)
@@ -53,7 +54,7 @@ def test_batches_of_tables(float64):
     rng = np.random.default_rng(0)
     values = rng.normal(size=(3, 4, 50))
     wanted = rng.uniform(size=values.shape) < 0.3
-    found = jax.jit(jax.vmap(lambda w, v: of_wanted(jnp.exp, w, v, v)))(wanted, values)
+    found = jax.jit(jax.vmap(lambda w, v: of_wanted(lambda v, _: jnp.exp(v), w, v, v)))(wanted, values)
     np.testing.assert_allclose(found, np.where(wanted, np.exp(values), values), rtol=1e-15)
 
 

@@ -50,10 +50,6 @@ class Polytope(NamedTuple):
             row = jnp.arange(self.edges.shape[-1], dtype=jnp.int32)[:, None]
         return self._replace(edges=None, row=row), self.edges
 
-    def with_edges(self, edges: Edges | None) -> Polytope:
-        """Any of the pairs of a polytope without edges, with the table of their edges."""
-        return self._replace(edges=edges)
-
 
 def polytope(kind: str, shape: dict[str, Any]) -> Polytope:
     """Core of a shape as a polytope.

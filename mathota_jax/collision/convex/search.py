@@ -141,8 +141,8 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
     """
     number = shapes.position.x.dtype
 
-    def prove(values: tuple[Difference, Vec3, Array, Array]) -> Penetration:
-        shapes, seed, half_proved, unproved = values
+    def prove(values: tuple[Difference, Vec3, Array], unproved: Array) -> Penetration:
+        shapes, seed, half_proved = values
         return epa(shapes, seed, half_proved, unproved, PROOF, tolerance)
 
     def turn(state: _Search) -> _Search:
@@ -157,7 +157,7 @@ def search_curved(shapes: Difference, tolerance: float) -> tuple[Simplex, Soluti
         cap = proved_cap(shapes, solution, tolerance)
         unproved = wanted & ~first & ~cap.whole
         nothing = Penetration(vector, zero, zero, zero)
-        least = of_wanted(prove, unproved, (shapes, solution.normal, cap.half, unproved), nothing)
+        least = of_wanted(prove, unproved, (shapes, solution.normal, cap.half), nothing)
         upper = jnp.where(first, jnp.where(overlap, jnp.inf, found.distance), state.upper)
         lower = jnp.where(cap.whole, -solution.separation, least.lower)
         # Shapes that are searched because they all but touch overlap for sure only where a depth is proved.

@@ -23,7 +23,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.difference import Difference
-from mathota_jax.collision.convex.polytope import Polytope
+from mathota_jax.collision.convex.polytope import Edges, Polytope
 from mathota_jax.spatial.indexing import gather, unstack
 from mathota_jax.spatial.settle import compute_once, settle_code, store
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, normalize, where
@@ -74,21 +74,20 @@ def separating_axis(shapes: Difference, a: Polytope, b: Polytope, wanted: Array)
     """
     (a, edges_a), (b, edges_b) = a.without_edges(), b.without_edges()
 
-    def best(values: tuple[Polytope, Polytope, Mat3, Vec3, Array]) -> Axis:
-        a, b, rotation, position, wanted = values
-        shape = position.x.shape
-        a, b = _of_lanes(a.with_edges(edges_a), shape), _of_lanes(b.with_edges(edges_b), shape)
+    def best(values: tuple[Polytope, Polytope, Mat3, Vec3], wanted: Array) -> Axis:
+        a, b, rotation, position = values
+        shape = wanted.shape
+        a, b = _of_lanes(a, edges_a, shape), _of_lanes(b, edges_b, shape)
         rotation, position, wanted = jax.tree.map(lambda c: _flat(c, shape), (rotation, position, wanted))
         axis = _best(_Placed(a, b, rotation, position), wanted)
         return jax.tree.map(lambda c: c.reshape(shape), axis)
 
     none = jax.tree.map(jnp.zeros_like, Axis(shapes.position, shapes.position.x))
-    return of_wanted(best, wanted, (a, b, shapes.rotation, shapes.position, wanted), none)
+    return of_wanted(best, wanted, (a, b, shapes.rotation, shapes.position), none)
 
 
-def _of_lanes(polytope: Polytope, shape: tuple[int, ...]) -> Polytope:
-    """A polytope with components (row, lane or 1), as are its edges."""
-    edges = polytope.edges
+def _of_lanes(polytope: Polytope, edges: Edges | None, shape: tuple[int, ...]) -> Polytope:
+    """A polytope `without_edges`, and theirs, with components (row, lane or 1)."""
     if edges is not None:
         edges = jnp.asarray(edges)
         if polytope.row is not None:
