@@ -229,8 +229,9 @@ def _parts_pay(native: Native, args: Sequence[Any]) -> bool:
     size = _part_size(native, args)
     if size == max(arg.shape[-1] for arg in args):
         return False
-    native, args = _primal(native, args)
-    return parts_pay(_traced(native, _signatures(args, size), _trace_context()), size)
+    primal, args = _primal(native, args)
+    program = _traced(primal, _signatures(args, size), _trace_context())
+    return parts_pay(program, size, of_derivative=primal is not native)
 
 
 def _part_size(native: Native, args: Sequence[Any]) -> int:

@@ -55,9 +55,9 @@ class Options:
         touches beyond them passes through (`Flag.CONTACT_OVERFLOW`). Where the matrix has too little room, fewer may be
         asked for.
       gradient_iterations: sweeps of the linear solver behind a derivative. None for the solution, by one dense system, in
-        scenes of up to six moving bodies whose pairs all have places of their own (see `broadphase`), and in what mechanisms
-        solve with their joints held; elsewhere for 1.5 times the solver's own sweeps where all rows are contacts with
-        friction, for which they are accelerated, and for twice as many where not.
+        scenes of up to ten moving bodies, and in what mechanisms solve with their joints held; elsewhere for 1.5 times the
+        solver's own sweeps where all rows are contacts with friction, for which they are accelerated, and for twice as many
+        where not.
       solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
         together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
         solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm

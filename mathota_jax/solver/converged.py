@@ -31,10 +31,10 @@ from jax import Array, lax
 
 from mathota_jax.solver import implicit, velocity_system
 from mathota_jax.solver.laws import Cone, Push
-from mathota_jax.solver.pgs import linearise
+from mathota_jax.solver.pgs import linearise, with_changes
 from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
+from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices, add_slices, largest_slice
@@ -342,5 +342,5 @@ def _solve_jvp(primals: tuple, tangents: tuple) -> tuple:
         return (velocity, impulses, failed), (d_velocity, impulses, jnp.zeros_like(failed))
     d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     d_impulses = implicit.solve(rows, slopes, right_sides)
-    d_velocity = add_impulses(visiting_all_turns(rows), d_velocity, d_impulses)
+    d_velocity = with_changes(rows, (velocity, impulses), (d_velocity, d_impulses))
     return (velocity, impulses, failed), (d_velocity, d_impulses, jnp.zeros_like(failed))

@@ -25,15 +25,16 @@ from jax import Array, lax
 from mathota_jax.solver import velocity_system
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import Dense
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity, visiting_all_turns
-from mathota_jax.solver.slopes import ConeSlopes, Slopes, left_unanswered
+from mathota_jax.solver.rows import Rows, add_impulses, visiting_all_turns
+from mathota_jax.solver.slopes import ConeSlopes, Slopes, left_unanswered, rates
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices
 
-STEPS = 3
-"""Measured in float32: residuals of 1e-6 for five boxes at rest and three that slide on one another, of 5e-4 for a cube of
-100 times the mass on a cube (3e-5 with a step more)."""
+STEPS, BODIES_A_STEP = 3, 2
+"""At least so many, and one for each so many bodies. Measured in float32: three leave residuals of 1e-6 for five boxes at
+rest and three that slide on one another, of 5e-4 for a cube of 100 times the mass on a cube (3e-5 with a step more); of a
+kick of ten stacked boxes three leave 0.13, five 6e-5."""
 
 STEPS_OF_ONE = {"float32": 7, "float64": 14}
 """Steps along the residuals themselves, of which contacts of a single body need no more than it has velocities where they
@@ -43,17 +44,17 @@ backwards, which would be equal, differ by 7e-7 with ten, by 2e-9 with fourteen.
 DELTA = {"float32": 1e-3, "float64": 1e-6}
 """Beside 1; in float32 round-off makes the first step wrong by some 1e-7 over its square."""
 
-FEW_BODIES = 6
-"""Moving bodies up to which the solution costs hardly more than sweeps. Measured beside 15 of them (the whole gradient of a
-step, float32, 256 worlds): 0.95 of the time for a slab, 1.02 to 1.05 for five boxes, of whose answer to a kick they leave
-half. Of ten boxes, whose places change from step to step, 1.7."""
+FEW_BODIES = 10
+"""Moving bodies up to which the default solver's derivatives are the solution. Measured beside 15 linear sweeps, which leave
+a third to a half of the answer to a kick (the whole gradient of a step, float32): 0.95 of the time for a slab, 1.02 to 1.05
+for five stacked boxes, 1.4 for eight, 1.54 for ten, 1.9 for sixteen."""
 
 Impulses = tuple[Array, ...]
 
 
 def is_small(rows: tuple[Rows, ...]) -> bool:
-    """Whether a dense system is worth its cost. Places that change from step to step would have to be looked up for it."""
-    return all(group.places is None and group.table.block_count <= FEW_BODIES for group in rows)
+    """Whether a dense system is worth its cost."""
+    return all(group.table.block_count <= FEW_BODIES for group in rows)
 
 
 def solve(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], right_sides: Impulses) -> Impulses:
@@ -64,14 +65,14 @@ def solve(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], right_sides: Impul
       slopes: K and H of each group.
       right_sides: r of each group.
     """
-    system = _System(visiting_all_turns(rows), slopes, right_sides)
-    product = functools.partial(left_unanswered, system.rows, slopes, system.nothing)
+    system = _System(rows, slopes, right_sides)
+    everywhere = visiting_all_turns(rows)  # the product is transposed
+    product = functools.partial(left_unanswered, everywhere, slopes, system.nothing)
     masses = tuple(slope.masses for slope in slopes)
 
     def solve_forward(_: object, right_sides: Impulses) -> Impulses:
         weights = tuple(safe_divide(jnp.ones_like(mass), mass) for mass in masses)
-        once = functools.partial(product, once=system.once)
-        return _solve(system.steps, system.way(), once, weights, right_sides, system.nothing)
+        return _solve(system.steps, system.way(), system.product, weights, right_sides, system.nothing)
 
     def solve_transposed(_: object, right_sides: Impulses) -> Impulses:
         return _solve(system.steps, system.way_back(), system.product_back, masses, right_sides, system.nothing)
@@ -93,13 +94,17 @@ class _System:
         """Stored; not where something else has to be transposed through it."""
         return compute_once(values, self.nothing)
 
+    def product(self, x: Impulses) -> Impulses:
+        """``A x``."""
+        return left_unanswered(self.rows, self.slopes, self.nothing, x, self.once)
+
     def product_back(self, x: Impulses) -> Impulses:
         """``A^T x``."""
         both = [slope.transposed(part) for slope, part in zip(self.slopes, x, strict=True)]
         passed = self.once(tuple(by_error for _, by_error in both))
         velocity = self.once(add_impulses(self.swapped, self.nothing, passed))
         return tuple(
-            part - by_impulse - row_velocity(group, velocity)
+            part - by_impulse - rates(group, velocity)
             for part, (by_impulse, _), group in zip(x, both, self.swapped, strict=True)
         )
 
@@ -119,11 +124,13 @@ class _System:
     @property
     def steps(self) -> int:
         """How many lead from nothing to the solution."""
-        return STEPS_OF_ONE[str(self.nothing.dtype)] if self.is_single else STEPS
+        if self.is_single:
+            return STEPS_OF_ONE[str(self.nothing.dtype)]
+        return max(STEPS, -(-self.nothing.shape[1] // BODIES_A_STEP))
 
     def inverse(self) -> velocity_system.Inverse:
         """``G^-1``."""
-        return velocity_system.inverse(self.rows, [functools.partial(self._answer, slope) for slope in self.slopes])
+        return velocity_system.inverse(self.rows, self.slopes, self._answer)
 
     def nearly(self, inverse: velocity_system.Inverse, residual: Impulses) -> Impulses:
         """``(A + delta)^-1`` times the residual."""
@@ -131,7 +138,7 @@ class _System:
         settled = self.once(settled)
         velocity = self.once(inverse.solve(self.once(add_impulses(self.rows, self.nothing, settled))))
         return tuple(
-            part + self._answer(slope, row_velocity(group, velocity))
+            part + self._answer(slope, rates(group, velocity))
             for part, slope, group in zip(settled, self.slopes, self.rows, strict=True)
         )
 
@@ -144,7 +151,7 @@ class _System:
         pushed = self.once(add_impulses(self.swapped, self.nothing, self.once(passed)))
         velocity = self.once(inverse.solve_back(pushed))
         return tuple(
-            slope.resolve_back(part + row_velocity(group, velocity), self.delta)
+            slope.resolve_back(part + rates(group, velocity), self.delta)
             for slope, part, group in zip(self.slopes, residual, self.swapped, strict=True)
         )
 

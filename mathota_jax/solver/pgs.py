@@ -21,17 +21,17 @@ from jax import Array
 
 from mathota_jax.solver import conjugate, implicit, linear_sweeps, sweeps
 from mathota_jax.solver.laws import Cone, Push
+from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import (
     Rows,
     add_changes,
     add_impulses,
-    matrix_velocity,
+    map_turns,
     row_velocity,
-    visiting_all_turns,
 )
 from mathota_jax.solver.slopes import Slopes, slopes_of
 from mathota_jax.solver.sweeps import Update
-from mathota_jax.spatial.settle import compute_once, store_cotangents
+from mathota_jax.spatial.settle import compute_once
 
 PLAIN_SWEEPS = 4
 """Last sweeps, in which contacts do not over-relax: they take to rest what longer steps leave swinging. Measured: with two,
@@ -120,44 +120,61 @@ def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangen
     velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses, change, momentum)
     if not rows:
         return (velocity, impulses), (d_velocity, impulses)
-    rows, d_rows = _dense(rows, d_rows)
     d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
+    # With all entries: the transposed system exchanges Jacobian and response.
+    dense = tuple(dataclasses.replace(group, matrix=_all_entries(group)) for group in rows)
     if gradient_iterations:
-        d_impulses = linear_sweeps.solve(gradient_iterations, rows, slopes, right_sides)
+        d_impulses = linear_sweeps.solve(gradient_iterations, dense, slopes, right_sides)
     else:
-        d_impulses = implicit.solve(rows, slopes, right_sides)
-    return (velocity, impulses), (add_impulses(visiting_all_turns(rows), d_velocity, d_impulses), d_impulses)
+        d_impulses = implicit.solve(dense, slopes, right_sides)
+    return (velocity, impulses), (with_changes(rows, (velocity, impulses), (d_velocity, d_impulses)), d_impulses)
 
 
-def _dense(rows: tuple[Rows, ...], d_rows: tuple[Rows, ...]) -> tuple[tuple[Rows, ...], tuple[Rows, ...]]:
-    """The rows and their change with all entries: the transposed system exchanges Jacobian and response."""
-    matrices, changes = (tuple(group.matrix for group in groups) for groups in (rows, d_rows))
-    dense = jax.jvp(lambda matrices: tuple(matrix.dense() for matrix in matrices), (matrices,), (changes,))
-    return tuple(  # type: ignore[return-value]
-        tuple(dataclasses.replace(group, matrix=matrix) for group, matrix in zip(groups, found, strict=True))
-        for groups, found in zip((rows, d_rows), dense, strict=True)
-    )
+def _all_entries(group: Rows) -> Any:
+    if isinstance(group.matrix, Dense):
+        return group.matrix
+    return map_turns(lambda part, _: part.matrix.dense(), group, ())
 
 
 def linearise(
     rows: tuple[Rows, ...], d_rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...], d_velocity: Array
 ) -> tuple[Array, tuple[Slopes, ...], tuple[Array, ...]]:
-    """Derivative of the fixed point of all laws, but for the change of the impulses. The matrices are dense.
+    """Derivative of the fixed point of all laws, but for the change of the impulses.
 
     Returns:
       The change of the velocity at fixed impulses; for each group the slopes of its law, and the change of its impulses at
       fixed impulses.
     """
-    for group, d_group, impulse in zip(visiting_all_turns(rows), d_rows, impulses, strict=True):
-        d_velocity = add_changes(group, d_group.matrix, d_velocity, impulse)
+    # As derivatives of what visits the turns in use alone, which can be transposed.
+    for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
+        added = functools.partial(_add_changes_by, group, impulse)
+        d_velocity = jax.jvp(added, (group.matrix, velocity), (d_group.matrix, d_velocity))[1]
     slopes, right_sides = [], []
     for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        # The error goes into all slopes of the law, its cotangent into that of every entry of the matrix.
-        error = compute_once(group.bias + row_velocity(group, velocity), velocity)
-        d_error = d_group.bias + row_velocity(group, d_velocity)
-        d_error = store_cotangents(d_error + matrix_velocity(group.table, d_group.matrix, group.places, velocity))
-        slopes.append(slopes_of(group.law, impulse, error))
-        right_sides.append(
-            jax.jvp(lambda law, error: law.update(impulse, error), (group.law, error), (d_group.law, d_error))[1]  # noqa: B023
+        slopes.append(
+            map_turns(lambda part, impulse: slopes_of(part.law, impulse, _error(part, velocity)), group, impulse)
         )
+        answer = functools.partial(_answer, group, impulse)
+        primals, changes = ((g.matrix, g.bias, g.law, v) for g, v in ((group, velocity), (d_group, d_velocity)))
+        right_sides.append(jax.jvp(answer, primals, changes)[1])
     return d_velocity, tuple(slopes), tuple(right_sides)
+
+
+def with_changes(rows: tuple[Rows, ...], primals: tuple[Array, Any], changes: tuple[Array, Any]) -> Array:
+    """A change of the velocity with those of the impulses, by what they are changes of."""
+    return jax.jvp(functools.partial(add_impulses, rows), primals, changes)[1]
+
+
+def _add_changes_by(group: Rows, impulse: Array, matrix: Any, velocity: Array) -> Array:
+    return add_changes(group, matrix, velocity, impulse)
+
+
+def _error(part: Rows, velocity: Array) -> Array:
+    """Stored: it goes into all slopes of the law, and its cotangent into that of every entry of the matrix."""
+    return compute_once(part.bias + row_velocity(part, velocity), velocity)
+
+
+def _answer(group: Rows, impulse: Array, matrix: Any, bias: Array, law: Any, velocity: Array) -> Array:
+    """The impulses that the law makes of those given."""
+    group = dataclasses.replace(group, matrix=matrix, bias=bias, law=law)
+    return map_turns(lambda part, impulse: part.law.update(impulse, _error(part, velocity)), group, impulse)

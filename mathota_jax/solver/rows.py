@@ -22,8 +22,9 @@ from mathota_jax.solver import visits
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import RowMatrix
 from mathota_jax.solver.table import Table, TracedTable
-from mathota_jax.spatial import counter
+from mathota_jax.spatial import chunk_derivatives, counter
 from mathota_jax.spatial.by_platform import by_platform
+from mathota_jax.spatial.chunk_derivatives import Chunked
 from mathota_jax.spatial.chunks import map_filled
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
 from mathota_jax.spatial.settle import store
@@ -293,16 +294,18 @@ def _add_at_filled_places(together: int, places: Places, matrix: Changes, veloci
 
 @_add_at_filled_places.defjvp
 def _add_at_filled_places_jvp(together: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    places, matrix, _, impulse = primals
+    places, matrix, velocity, impulse = primals
     _, d_matrix, d_velocity, d_impulse = tangents
+    leaves, structure = jax.tree.flatten((places.blocks, matrix, impulse))
+    changes = [*(None for _ in places.blocks), *jax.tree.leaves((d_matrix, d_impulse))]
 
-    def body(d_velocity: Array, at_turn: tuple) -> tuple[Array, None]:
-        blocks, values, d_values = at_turn
-        d_changes = jax.jvp(lambda part, impulse: part.changes(impulse, together), values, d_values)[1]
-        return receive(d_velocity, blocks, d_changes), None
+    def of_turn(*leaves: Array) -> list[Array]:
+        blocks, part, values = jax.tree.unflatten(structure, leaves)
+        return [receive(jnp.zeros_like(velocity), blocks, part.changes(values, together))]
 
-    scanned = (places.blocks, (matrix, impulse), (d_matrix, d_impulse))
-    return _add_at_filled_places(together, *primals), lax.scan(body, d_velocity, scanned)[0]
+    added = Chunked(of_turn, 0, impulse.shape[0], summed=True)
+    d_added = chunk_derivatives.tangents(added, leaves, places.turns, changes)[0]
+    return _add_at_filled_places(together, *primals), d_velocity + d_added
 
 
 def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...], together: int) -> Array:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.solver.laws import Bounded, Cone, Law
-from mathota_jax.solver.rows import Rows, add_impulses, row_velocity
+from mathota_jax.solver.rows import Rows, add_impulses, map_turns, row_velocity
 from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once
@@ -164,9 +164,14 @@ def left_unanswered(
     """
     velocity = once(add_impulses(rows, nothing, impulses))
     return tuple(
-        part - slope.update(part, row_velocity(group, velocity))
+        part - slope.update(part, rates(group, velocity))
         for part, group, slope in zip(impulses, rows, slopes, strict=True)
     )
+
+
+def rates(group: Rows, velocity: Array) -> Array:
+    """``J v`` of the turns in use, (turn, row, column, world)."""
+    return map_turns(lambda part, _: row_velocity(part, velocity), group, ())
 
 
 def slopes_of(law: Law, impulse: Array, error: Array) -> Slopes:

@@ -7,6 +7,7 @@ matrix ``G = 1 - M^-1 J^T H J``. It has one row for each component of a velocity
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -15,7 +16,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.solver import dense
-from mathota_jax.solver.rows import Rows
+from mathota_jax.solver.rows import Rows, map_turns
+from mathota_jax.solver.slopes import Slopes
+from mathota_jax.spatial import counter
 from mathota_jax.spatial.settle import compute_once, materialize
 from mathota_jax.spatial.spread import add_scaled
 
@@ -28,7 +31,8 @@ def solve_once(rows: tuple[Rows, ...], by_error: tuple[Array, ...], right_side: 
     """
     weighted = [[_weigh(matrix, side) for side in group.jacobian] for group, matrix in zip(rows, by_error, strict=True)]
     # Joined with the worlds last, and stored: within the kernel that makes it, a transposition reads one number at a time.
-    columns = jnp.concatenate([_system(rows, weighted).swapaxes(0, 1), _vector(right_side)[None]])
+    products = [_products(group, sides) for group, sides in zip(rows, weighted, strict=True)]
+    columns = jnp.concatenate([_system(rows, products).swapaxes(0, 1), _vector(right_side)[None]])
     lu = lax.linalg.lu(materialize(columns).transpose(2, 1, 0))[0]
     found = lax.linalg.triangular_solve(lu[..., :-1], lu[..., -1:], left_side=True, lower=False)
     return _velocity(found[..., 0].T, right_side)
@@ -48,12 +52,14 @@ class Inverse(NamedTuple):
         return _velocity(add_scaled(self.matrix.swapaxes(0, 1), _vector(right_side)), right_side)
 
 
-def inverse(rows: tuple[Rows, ...], answers: Sequence[Callable[[Array], Array]]) -> Inverse:
-    """``G^-1``; the answers are, of each group, the products (turn, row, column, world) of H with errors."""
-    weighted = [
-        [jax.vmap(answer, 2, 2)(side) for side in group.jacobian] for group, answer in zip(rows, answers, strict=True)
-    ]
-    return Inverse(compute_once(dense.inverse(_system(rows, weighted), rows[0].response[0].shape[2]), rows[0].bias))
+def inverse(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], answer: Callable[[Slopes, Array], Array]) -> Inverse:
+    """``G^-1``; the answers by the slopes of each group are the products (turn, row, column, world) of H with errors."""
+
+    def products(part: Rows, slope: Slopes) -> Array:
+        return _products(part, [jax.vmap(functools.partial(answer, slope), 2, 2)(side) for side in part.jacobian])
+
+    found = [map_turns(products, group, slope) for group, slope in zip(rows, slopes, strict=True)]
+    return Inverse(compute_once(dense.inverse(_system(rows, found), rows[0].response[0].shape[2]), rows[0].bias))
 
 
 def _vector(velocity: Array) -> Array:
@@ -66,16 +72,13 @@ def _velocity(vector: Array, like: Array) -> Array:
     return vector.reshape(like.shape[1], like.shape[0], -1).swapaxes(0, 1)
 
 
-def _system(rows: tuple[Rows, ...], weighted: Sequence[Sequence[Array]]) -> Array:
-    """``G``, (n, n, world), from ``H J`` of each group and side."""
+def _system(rows: tuple[Rows, ...], products: Sequence[Array]) -> Array:
+    """``G``, (n, n, world), from the `_products` of each group."""
     count, components = rows[0].table.block_count, rows[0].response[0].shape[2]
-    worlds = max(side.shape[-1] for sides in weighted for side in sides)
+    worlds = max(product.shape[-1] for product in products)
     total = jnp.zeros((count * count, components, components, worlds), rows[0].bias.dtype)
-    for group, sides in zip(rows, compute_once(weighted, rows[0].bias), strict=True):
-        blocks = _blocks(group)
-        for receiver, response in zip(blocks, group.response, strict=True):
-            for source, jacobian in zip(blocks, sides, strict=True):
-                total = _scatter(group, total, receiver, source, response, jacobian)
+    for group, product in zip(rows, products, strict=True):
+        total = _scatter(group, total, product)
     system = total.reshape(count, count, components, components, worlds).swapaxes(1, 2)
     size = count * components
     return jnp.eye(size, dtype=total.dtype)[..., None] - system.reshape(size, size, worlds)
@@ -93,29 +96,40 @@ def _weigh(matrix: Array, jacobian: Array) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def _scatter(group: Rows, total: Array, receiver: Array, source: Array, response: Array, jacobian: Array) -> Array:
-    """Adds the products of the constraints (turn, constraint) at their pairs of blocks."""
-    count, together = group.table.block_count, group.table.together
-    worlds = total.shape[-1]
-    of_points = [
-        functools.reduce(
-            jnp.add,
-            [
-                response[:, row, :, None, point::together] * jacobian[:, row, None, :, point::together]
-                for row in range(jacobian.shape[1])
-            ],
-        )
-        for point in range(together)
+def _products(group: Rows, weighted: Sequence[Array]) -> Array:
+    """``M^-1 J^T`` of a side times ``H J`` of a side, (turn, constraint, sides, component, component', world)."""
+    together = group.table.together
+    of_sides = []
+    for response, jacobian in itertools.product(group.response, compute_once(list(weighted), group.bias)):
+        terms = [
+            response[:, row, :, None, point::together] * jacobian[:, row, None, :, point::together]
+            for point in range(together)
+            for row in range(jacobian.shape[1])
+        ]
+        of_sides.append(jnp.moveaxis(compute_once(functools.reduce(jnp.add, terms), group.bias), 3, 1))
+    return jnp.stack(of_sides, axis=2)
+
+
+def _scatter(group: Rows, total: Array, products: Array) -> Array:
+    """Adds the products of the constraints at their pairs of blocks."""
+    count = group.table.block_count
+    blocks = _blocks(group)
+    pairs = [
+        jnp.where((receiver < count) & (source < count), receiver * count + source, count * count)
+        for receiver, source in itertools.product(blocks, blocks)
     ]
-    product = functools.reduce(jnp.add, of_points)  # (turn, component, component', constraint, world)
-    product = jnp.moveaxis(compute_once(product, product), 3, 1)
-    product = product.reshape(-1, *product.shape[2:])
-    index = jnp.where((receiver < count) & (source < count), receiver * count + source, count * count)
+    index = jnp.stack(pairs, axis=2)  # (turn, constraint, receiver and source, world)
     if group.places is None:
-        return total.at[index.reshape(-1)].add(product, mode="drop")
-    index = index.reshape(-1, index.shape[-1])
-    return jax.vmap(lambda t, i, p: t.at[i].add(p, mode="drop"), (-1, -1, -1), -1)(
-        total,
-        jnp.broadcast_to(index, (index.shape[0], worlds)),
-        jnp.broadcast_to(product, (*product.shape[:-1], worlds)),
-    )
+        return total.at[index.reshape(-1)].add(products.reshape(-1, *products.shape[3:]), mode="drop")
+    lanes = jnp.arange(total.shape[-1])
+    index = jnp.broadcast_to(index, (*index.shape[:-1], len(lanes)))
+    products = jnp.broadcast_to(products, (*products.shape[:-1], len(lanes)))
+
+    def of_turn(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        turn, total = carry
+        places, product = counter.row((index, products), turn)
+        change = jnp.moveaxis(product, -1, 2)  # what the worlds are scattered by comes first
+        return counter.following(turn), total.at[places, :, :, lanes].add(change, mode="drop")
+
+    turns = index.shape[0] if group.places.turns is None else group.places.turns
+    return lax.fori_loop(0, turns, of_turn, (counter.start(), total))[1]

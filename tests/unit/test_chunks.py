@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mathota_jax.spatial.chunk_derivatives import Chunked, tangents
 from mathota_jax.spatial.chunks import MOST, map_filled
 
 
@@ -79,3 +80,59 @@ def test_what_the_function_closes_over_has_derivatives_too():
     inner = 0.02 * s
     expected = s + s * np.cos(inner) - inner * s * np.sin(inner)
     np.testing.assert_allclose(jax.jit(derivative)(weight, places), [0.0, expected], rtol=1e-5)
+
+
+def heap(x, weight):
+    """Sum of w^2 x^3 of the filled rows, of a table with room for many more."""
+    return map_filled(lambda rows: {"cube": weight**2 * rows**3, "sign": rows > 0}, x, jnp.int32(3))["cube"][:3].sum()
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.checkpoint], ids=["plain", "checkpoint"])
+def test_second_derivatives_in_any_order(wrap):
+    """Forwards and backwards, one over the other: w^2 6 x, and 6 w x^2 by both."""
+    x, weight = jnp.asarray([0.5, -1.0, 2.0] + [3.0] * 30), jnp.asarray(1.5)
+    by_x = np.diag(np.where(np.arange(33) < 3, 6 * 1.5**2 * np.asarray(x), 0.0))
+    mixed = np.where(np.arange(33) < 3, 6 * 1.5 * np.asarray(x) ** 2, 0.0)
+    for outer in (jax.jacfwd, jax.jacrev):
+        for inner in (jax.jacfwd, jax.jacrev):
+            found = jax.jit(outer(inner(wrap(heap), 0), (0, 1)))(x, weight)
+            np.testing.assert_allclose(found[0], by_x, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(found[1], mixed, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("used", [0, 2, 5])
+def test_a_sum_over_the_chunks_in_use(used):
+    """As JAX differentiates the sum itself, forwards and backwards."""
+    rng = np.random.default_rng(0)
+    rows, change, weight = (jnp.asarray(rng.normal(size=size)) for size in ((5, 3), (5, 3), ()))
+
+    def truth(rows, weight):
+        return jnp.sum(weight * rows[:used] ** 2, axis=0)
+
+    def added(leaves):
+        return [leaves[0] * leaves[1] ** 2]
+
+    chunked = Chunked(lambda *leaves: added(leaves), 1, 5, summed=True)
+    leaves = [weight, rows]
+    for way in (chunked.in_loop, chunked.at_once, chunked.one_by_one):
+        np.testing.assert_allclose(way(leaves, jnp.int32(used))[0], truth(rows, weight), rtol=1e-6, atol=1e-7)
+
+    def forwards(change, by_weight):
+        return tangents(chunked, leaves, jnp.int32(used), [by_weight, change])[0]
+
+    one = jnp.ones(())
+    np.testing.assert_allclose(
+        forwards(change, one), jax.jvp(truth, (rows, weight), (change, one))[1], rtol=1e-6, atol=1e-7
+    )
+    cotangent = jnp.asarray([1.0, -2.0, 0.5])
+    found = jax.linear_transpose(forwards, change, one)(cotangent)
+    for value, expected in zip(found, jax.vjp(truth, rows, weight)[1](cotangent), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_derivatives_on_gpus_have_no_loop():
+    """All chunks side by side there; lowered for CUDA on any machine."""
+    x = jnp.arange(33.0)
+    lowered = jax.jit(jax.grad(heap)).trace(x, jnp.asarray(1.5)).lower(lowering_platforms=("cuda",))
+    assert "stablehlo.while" not in lowered.as_text()
+    assert "stablehlo.while" in jax.jit(jax.grad(heap)).lower(x, jnp.asarray(1.5)).as_text()

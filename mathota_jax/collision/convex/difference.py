@@ -20,7 +20,8 @@ from mathota_jax.spatial.settle import compute_once, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm
 from mathota_jax.struct import pytree, static
 
-CODES = 64
+CODE_BITS = 6
+CODES = 1 << CODE_BITS
 """Piece codes of one shape are below this; a pair of pieces has the code ``CODES * code_a + code_b``."""
 
 
@@ -50,13 +51,13 @@ class Difference:
 
     def points(self, pieces: Array, direction: Vec3) -> tuple[Vec3, Vec3]:
         """Points of A and of B, in the frame of A, of a piece pair at a stored direction (A's along it, B's against it)."""
-        point_a = SUPPORT[self.kind_a].point(self.a, pieces // CODES, direction)
+        point_a = SUPPORT[self.kind_a].point(self.a, code_of(pieces, of_b=False), direction)
         against = -self.rotation.apply_transposed(direction)
         if SUPPORT[self.kind_b].rim_radius is not None:
             # Along the axis of a rim what is left across it is round-off, but one and the same for all components: else
             # they belong to different points of the rim, and together to none.
             against = compute_once(against, direction.x)
-        local = SUPPORT[self.kind_b].point(self.b, pieces % CODES, against)
+        local = SUPPORT[self.kind_b].point(self.b, code_of(pieces, of_b=True), against)
         return point_a, self.position + self.rotation.apply(local)
 
     def point(self, pieces: Array, direction: Vec3) -> Vec3:
@@ -68,6 +69,11 @@ class Difference:
         """Point of B - A that is least along `direction`, and its piece pair."""
         pieces = self.pieces(direction)
         return self.point(pieces, direction), pieces
+
+
+def code_of(pieces: Array, *, of_b: bool) -> Array:
+    """Piece of one shape in the code of a pair, by its bits: division of integers takes jnp six operations."""
+    return pieces & (CODES - 1) if of_b else pieces >> CODE_BITS
 
 
 def difference(kind_a: str, a: Parameters, pose_a: Pose, kind_b: str, b: Parameters, pose_b: Pose) -> Difference:

@@ -152,7 +152,7 @@ def gjk(shapes: Difference, start: Vec3, shift: Vec3, wanted: Array, iterations:
     pieces, points, points_a = zip(*(_slot(slots, k) for k in range(3)), strict=True)
     point_a = point_b = None
     if tracked:
-        weights = barycentric(points, state.count > 1, state.count > 2)
+        weights = compute_once(barycentric(points, state.count > 1, state.count > 2), start.x)
         point_a = combine(weights, points_a)
         point_b = point_a + combine(weights, points) - shift
     direction, distance = unit(state.closest, first), norm(state.closest)

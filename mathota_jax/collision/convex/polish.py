@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.collision.convex.difference import CODES, Difference, Weights, barycentric, combine
+from mathota_jax.collision.convex.difference import Difference, Weights, barycentric, code_of, combine
 from mathota_jax.collision.convex.gjk import Simplex
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.convex.ties import Ties, distinct, join, leave, single
@@ -164,10 +164,10 @@ def solve(shapes: Difference, simplex: Simplex, wanted: Array) -> Solution:
         points = stacked_differences(shapes, state.ties, state.normal)
         normal = compute_once(newton_step(shapes, state.ties, state.normal, points), state.best.separation)
         points = stacked_differences(shapes, state.ties, normal)
-        extreme, pieces = shapes.least(normal)
+        extreme, pieces = compute_once(shapes.least(normal), state.best.separation)
         reach = dot(normal, extreme)
         turned = normal - state.normal
-        weights = barycentric(points, state.ties.two, state.ties.three)
+        weights = compute_once(barycentric(points, state.ties.two, state.ties.three), state.best.separation)
         # Where a piece pair has left, what remains must have its closest point along the normal.
         across = combine(weights, points)
         across = across - normal * dot(normal, across)
@@ -234,7 +234,7 @@ def rim_radii(shapes: Difference, ties: Ties, weights: Weights) -> list[tuple[bo
     for of_b, kind, shape in ((False, shapes.kind_a, shapes.a), (True, shapes.kind_b, shapes.b)):
         rim_radius = SUPPORT[kind].rim_radius
         if rim_radius is not None:
-            codes = [pieces % CODES if of_b else pieces // CODES for pieces in ties.pieces]
+            codes = [code_of(pieces, of_b=of_b) for pieces in ties.pieces]
             mean = sum(
                 (w * rim_radius(shape, c) for w, c in zip(weights, codes, strict=True)), jnp.zeros_like(weights[0])
             )
@@ -357,7 +357,7 @@ def _flat_end(shapes: Difference, simplex: Simplex, result: Closest, of_b: bool,
     level = along >= best - rounding / 2.0
 
     pieces = frozen.pieces(lax.stop_gradient(normal))
-    point_a, point_b = shapes.points(pieces, normal)
+    point_a, point_b = compute_once(shapes.points(pieces, normal), best)
     other, searched = (point_a, simplex.point_a) if of_b else (point_b, simplex.point_b)
     assert searched is not None
     offset = searched - lax.stop_gradient(other)
@@ -374,7 +374,7 @@ def _flat_end(shapes: Difference, simplex: Simplex, result: Closest, of_b: bool,
     beside = lax.stop_gradient(shapes.rotation.apply_transposed(other - shapes.position) if of_b else other)
     rim_radius = SUPPORT[shapes.kind_b if of_b else shapes.kind_a].rim_radius
     assert rim_radius is not None
-    radius = rim_radius(frozen.b if of_b else frozen.a, pieces % CODES if of_b else pieces // CODES)
+    radius = rim_radius(frozen.b if of_b else frozen.a, code_of(pieces, of_b=of_b))
     over = beside.x * beside.x + beside.z * beside.z <= (radius + 4.0 * rounding) ** 2
     chosen = settle_code((level & over).astype(best.dtype)) == 1
     gap = dot(normal, point_b - point_a)

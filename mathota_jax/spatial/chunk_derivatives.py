@@ -1,0 +1,231 @@
+"""Derivatives, forwards and backwards, of a function of the chunks in use of a table whose size is known only in the step.
+
+A loop of so many turns as the step says has no reverse mode in JAX. A loop over all chunks that passes over the empty ones
+has, but stores what every chunk would need, which for scenes with room for many pairs was measured to take longer than all
+else. So the tangents are a primitive of their own, linear in those given: a loop over the chunks in use, whose transpose is
+another, in which each chunk is computed again. What is stored is what the function gets.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from mathota_jax.spatial import counter
+from mathota_jax.spatial.by_platform import by_platform
+
+Shapes = tuple[jax.ShapeDtypeStruct, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Chunked:
+    """A function of chunks by leaves.
+
+    Attributes:
+      function: from the leaves of one chunk and those that all chunks share, constants first, to those of the result.
+      constant_count: how many of the leaves are shared; the others have a leading axis of chunks.
+      count: number of chunks.
+      summed: whether the results are added up instead of stacked.
+    """
+
+    function: Callable[..., list[Array]]
+    constant_count: int
+    count: int
+    summed: bool = False
+
+    def shapes(self, leaves: Sequence[Any]) -> Shapes:
+        """What all chunks together give."""
+        count = () if self.summed else (self.count,)
+        return tuple(jax.ShapeDtypeStruct((*count, *x.shape), x.dtype) for x in self._shapes_of_one(leaves))
+
+    def _shapes_of_one(self, leaves: Sequence[Any]) -> Sequence[Any]:
+        return jax.eval_shape(lambda *leaves: self.function(*self.at(leaves, 0)), *leaves)
+
+    def at(self, leaves: Sequence[Any], k: Any) -> list[Any]:
+        """What the function gets of a chunk; `k` is a number, or a `counter`."""
+        row = counter.row if isinstance(k, Array) and k.ndim else lambda leaf, k: leaf[k]
+        return [leaf if place < self.constant_count else row(leaf, k) for place, leaf in enumerate(leaves)]
+
+    def joined(self, results: Sequence[Array], found: Sequence[Array], k: Array) -> list[Array]:
+        """The results with what is found of a chunk."""
+        if self.summed:
+            return [total + x for total, x in zip(results, found, strict=True)]
+        return [counter.put(all_, x, k) for all_, x in zip(results, found, strict=True)]
+
+    def in_loop(self, leaves: Sequence[Array], used: Array) -> list[Array]:
+        """The results of the chunks in use, and 0 elsewhere. Not differentiable."""
+
+        def body(_: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
+            k, results = carry
+            return counter.following(k), self.joined(results, self.function(*self.at(leaves, k)), k)
+
+        return lax.fori_loop(0, used, body, (counter.start(), _zeros(self.shapes(leaves))))[1]
+
+    def at_once(self, leaves: Sequence[Array], used: Array) -> list[Array]:
+        """The same side by side."""
+
+        def of_chunk(k: Array, chunk: Sequence[Array]) -> list[Array]:
+            found = self.function(*leaves[: self.constant_count], *chunk)
+            return [jnp.where(k < used, x, jnp.zeros_like(x)) for x in found]
+
+        found = jax.vmap(of_chunk)(jnp.arange(self.count), list(leaves[self.constant_count :]))
+        return [x.sum(0) for x in found] if self.summed else found
+
+    def one_by_one(self, leaves: Sequence[Array], used: Array) -> list[Array]:
+        """The same in a loop over all chunks, which JAX can do anything with."""
+        shapes = self._shapes_of_one(leaves)
+
+        def body(k: Array, chunk: Sequence[Array]) -> tuple[Array, list[Array]]:
+            def evaluate(chunk: Sequence[Array]) -> list[Array]:
+                return self.function(*leaves[: self.constant_count], *chunk)
+
+            return k + 1, lax.cond(k < used, evaluate, lambda _: _zeros(shapes), chunk)
+
+        found = lax.scan(body, jnp.zeros((), used.dtype), list(leaves[self.constant_count :]))[1]
+        return [x.sum(0) for x in found] if self.summed else found
+
+
+Evaluate = Callable[[Sequence[Array], Array], list[Array]]
+
+
+def tangents(chunked: Chunked, leaves: Sequence[Array], used: Array, changes: Sequence[Any]) -> list[Any]:
+    """Those of the results, by those of the leaves, which are of no number type where the leaves are not."""
+    mask = tuple(_is_real(leaf) for leaf in leaves)
+    linear = [change for change, real in zip(changes, mask, strict=True) if real]
+    found = iter(_tangents_p.bind(used, *leaves, *linear, chunked=chunked, mask=mask))
+    shapes = chunked.shapes(leaves)
+    return [next(found) if _is_real(x) else np.zeros(x.shape, jax.dtypes.float0) for x in shapes]
+
+
+def _is_real(value: Any) -> bool:
+    return jnp.issubdtype(value.dtype, jnp.inexact)
+
+
+def _zeros(shapes: Sequence[Any]) -> list[Array]:
+    return [jnp.zeros(x.shape, x.dtype) for x in shapes]
+
+
+def _restricted(evaluate: Callable[..., list[Array]], leaves: Sequence[Array], mask: Sequence[bool]) -> Callable:
+    """The real results of a function of leaves by those in the mask."""
+
+    def function(*linear: Array) -> list[Array]:
+        replacements = iter(linear)
+        args = [next(replacements) if selected else leaf for leaf, selected in zip(leaves, mask, strict=True)]
+        return [result for result in evaluate(args) if _is_real(result)]
+
+    return function
+
+
+def _selected(leaves: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
+    return [leaf for leaf, selected in zip(leaves, mask, strict=True) if selected]
+
+
+def _split(args: Sequence[Any], mask: Sequence[bool]) -> tuple[Any, Sequence[Any], Sequence[Any]]:
+    """The number of chunks in use, the leaves, and what is linear."""
+    return args[0], args[1 : 1 + len(mask)], args[1 + len(mask) :]
+
+
+def _push(evaluate: str, *args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
+    """The tangents by JAX's derivative of a method of `Chunked`."""
+    used, leaves, changes = _split(args, mask)
+    of_leaves = _restricted(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask)
+    return jax.jvp(of_leaves, _selected(leaves, mask), list(changes))[1]
+
+
+def _pull(evaluate: str, *args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
+    """The cotangents likewise."""
+    used, leaves, cotangents = _split(args, mask)
+    of_leaves = _restricted(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask)
+    return list(jax.vjp(of_leaves, *_selected(leaves, mask))[1](list(cotangents)))
+
+
+def _push_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
+    used, leaves, changes = _split(args, mask)
+    of_changes = dataclasses.replace(chunked, constant_count=sum(mask[: chunked.constant_count]))
+
+    def body(_: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
+        k, results = carry
+        chunk = chunked.at(leaves, k)
+        of_leaves = _restricted(lambda leaves: chunked.function(*leaves), chunk, mask)
+        found = jax.jvp(of_leaves, _selected(chunk, mask), of_changes.at(list(changes), k))[1]
+        return counter.following(k), chunked.joined(results, found, k)
+
+    shapes = [x for x in chunked.shapes(leaves) if _is_real(x)]
+    return lax.fori_loop(0, used, body, (counter.start(), _zeros(shapes)))[1]
+
+
+def _pull_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
+    used, leaves, cotangents = _split(args, mask)
+    constants = sum(mask[: chunked.constant_count])
+
+    def body(_: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
+        k, totals = carry
+        chunk = chunked.at(leaves, k)
+        of_leaves = _restricted(lambda leaves: chunked.function(*leaves), chunk, mask)
+        given = list(cotangents) if chunked.summed else counter.row(list(cotangents), k)
+        found = jax.vjp(of_leaves, *_selected(chunk, mask))[1](given)
+        shared = [total + x for total, x in zip(totals[:constants], found[:constants], strict=True)]
+        own = [counter.put(all_, x, k) for all_, x in zip(totals[constants:], found[constants:], strict=True)]
+        return counter.following(k), shared + own
+
+    return lax.fori_loop(0, used, body, (counter.start(), _zeros(_selected(leaves, mask))))[1]
+
+
+def _by_platform(in_loop: Callable, at_once: Callable, *args: Array, **params: Any) -> list[Array]:
+    """GPUs wait longer for the end of a loop to be known than for the work on what is empty."""
+    on_cpu, on_gpu = functools.partial(in_loop, **params), functools.partial(at_once, "at_once", **params)
+    return by_platform(on_cpu, on_gpu, jax.eval_shape(on_cpu, *args), *args)
+
+
+def _primitive(name: str, in_loop: Callable, by_jax: Callable) -> Primitive:
+    """One of both, whose own derivative is that of the loop over all chunks."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    evaluate = functools.partial(_by_platform, in_loop, by_jax)
+    everywhere = functools.partial(by_jax, "one_by_one")
+
+    def abstract(*avals: Any, **params: Any) -> list[ShapedArray]:
+        arguments = (jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals)
+        found = jax.eval_shape(functools.partial(in_loop, **params), *arguments)
+        return [ShapedArray(x.shape, x.dtype) for x in found]
+
+    def jvp(primals: Sequence[Array], changes: Sequence[Any], **params: Any) -> tuple[list[Array], list[Array]]:
+        changes = [ad.instantiate_zeros(change) for change in changes]
+        found = jax.jvp(functools.partial(everywhere, **params), primals, changes)[1]
+        return primitive.bind(*primals, **params), found
+
+    def batched(args: Sequence[Array], axes: Sequence[int | None], **params: Any) -> tuple[list[Array], list[int]]:
+        found = jax.vmap(functools.partial(everywhere, **params), axes)(*args)
+        return found, [0] * len(found)
+
+    primitive.def_impl(lambda *args, **params: jax.jit(functools.partial(evaluate, **params))(*args))
+    primitive.def_abstract_eval(abstract)
+    ad.primitive_jvps[primitive] = jvp
+    batching.primitive_batchers[primitive] = batched
+    mlir.register_lowering(primitive, mlir.lower_fun(evaluate, multiple_results=True))
+    return primitive
+
+
+def _transpose(cotangents: Sequence[Any], *args: Any, chunked: Chunked, mask: tuple[bool, ...]) -> list[Any]:
+    used, leaves, changes = _split(args, mask)
+    unknown = iter([ad.is_undefined_primal(change) for change in changes])
+    wanted = tuple(selected and next(unknown) for selected in mask)
+    given = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
+    found = iter(_cotangents_p.bind(used, *leaves, *given, chunked=chunked, mask=wanted))
+    of_changes = [next(found) if ad.is_undefined_primal(change) else None for change in changes]
+    return [None] * (1 + len(mask)) + of_changes
+
+
+_tangents_p = _primitive("chunk_tangents", _push_in_loop, _push)
+_cotangents_p = _primitive("chunk_cotangents", _pull_in_loop, _pull)
+ad.primitive_transposes[_tangents_p] = _transpose
