@@ -27,7 +27,9 @@ jax.block_until_ready(compiled(model, state))
 """
 
 
-@pytest.mark.parametrize("flags", ["", QUICK_COMPILER], ids=["default", "quick"])
+@pytest.mark.parametrize(
+    "flags", [pytest.param("", id="default"), pytest.param(QUICK_COMPILER, id="quick", marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize(("count", "limit"), [(1, 2.0), (10, 6.0)])
 def test_compile_time_of_a_step(count, limit, flags, gate):
     environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false", "XLA_FLAGS": flags}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import BallAndSocket, Box, Hinge, SceneBuilder, Sphere
-from tests.marks import QUICK_AND_SLOW_PRECISION
+from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
 from tests.scenes import DOWN, invariants, motion, record_worlds, repeat, rotation_matrix, undamped
 
 SOLVERS = {"default": {}, "converged": {"solver": "converged"}, "sweeps": {"exact_joints": False}}
@@ -66,7 +66,7 @@ def test_ten_links_stay_joined(float64, solver, gate):
 
 
 @pytest.mark.parametrize("solver", QUICK_AND_SLOW)
-@pytest.mark.parametrize("links", [2, 20])
+@pytest.mark.parametrize("links", slow_but((20,), (2, 20)))
 def test_chain_does_not_blow_up_at_a_large_step(links, solver, gate):
     _, tip, energy = swing(links, 1 / 60, 2.0, **SOLVERS[solver])
     assert np.isfinite(tip).all()
@@ -80,14 +80,14 @@ def test_other_chains_do_not_blow_up_at_a_large_step(links, solver, gate):
     test_chain_does_not_blow_up_at_a_large_step(links, solver, gate)
 
 
-@pytest.mark.parametrize("solver", [*QUICK_AND_SLOW, "sweeps"])
+@pytest.mark.parametrize("solver", [*QUICK_AND_SLOW, pytest.param("sweeps", marks=pytest.mark.slow)])
 def test_thin_rods_do_not_blow_up_at_a_large_step(float64, solver, gate):
     _, tip, energy = swing(2, 1 / 60, 2.0, thickness=0.01, **SOLVERS[solver])
     assert np.isfinite(tip).all()
     gate("energy gained / swing energy", max(0.0, energy.max()), 0.05)
 
 
-@pytest.mark.parametrize("links", [1, 2])
+@pytest.mark.parametrize("links", slow_but((2,), (1, 2)))
 def test_short_chains_swing_as_they_should(float64, links, gate):
     gap, tip, energy = swing(links, 1 / 960, 1.0, velocity_iterations=80)
     gate("largest gap / link", gap, 1e-4)

@@ -5,9 +5,11 @@ import pytest
 from mathota_jax import Options, measured
 from tests.benchmarks.work_precision import engine
 from tests.benchmarks.work_precision.scenes import SCENES, start_of
+from tests.marks import slow_but
 
 ERRORS = (3e-1, 1e-1, 3e-2, 1e-2, 3e-3, 1e-3)
 FACTOR = 2.0
+SINGLE = ("slide", "bounce", "roll", "tumble")
 
 
 def reached(name, options):
@@ -28,7 +30,7 @@ def offered(kind):
     return [error for error in ERRORS if error >= least_error(kind)]
 
 
-@pytest.mark.parametrize("name", ["slide", "bounce", "roll", "tumble", "stack10", "massratio"])
+@pytest.mark.parametrize("name", slow_but((*SINGLE, "stack10"), (*SINGLE, "stack10", "massratio")))
 def test_the_promise_for_the_kind_of_a_scene(name, gate):
     error = max(1e-2, least_error(SCENES[name].kind))
     gate("error", reached(name, Options.for_error(error, SCENES[name].kind)), FACTOR * error)

@@ -12,6 +12,7 @@ from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import mechanism, mechanism_coordinates, mechanism_links
 from mathota_jax.constraints.joint_rows import joint_rows
 from mathota_jax.constraints.mechanism_layout import covers, layout
+from tests.marks import slow_but
 from tests.scenes import undamped
 
 ANCHOR, AXIS = (0.3, 0.2, 0.1), (0.2, 0.5, 1.0)
@@ -44,7 +45,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_but(("all kinds", "branches"), CASES))
 def test_impulses_are_those_of_the_dense_matrix(float64, case, gate):
     """At poses at which the joints are broken too, in two worlds."""
     model, state = jax.tree.map(lambda x: x.astype(jnp.result_type(float)) if x.dtype.kind == "f" else x, CASES[case])

@@ -11,6 +11,7 @@ from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import mechanism, mechanism_links
 from mathota_jax.constraints.joint_rows import joint_rows
 from mathota_jax.constraints.mechanism_layout import covers, layout
+from tests.marks import slow_but
 from tests.scenes import undamped
 
 ACROSS = (0, 0, 1)
@@ -50,7 +51,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_but(("two loops of several kinds",), CASES))
 def test_velocities_are_projected(float64, case, gate):
     """Bodies hit at random: what is left is the part of their motion that the joints allow, of least change.
 

@@ -32,7 +32,7 @@ def rod(length):
 FEET = Hinge(0, 1, (0, 0, 0), AXIS), Hinge(0, 2, (1, 0, 0), AXIS)
 
 
-@pytest.mark.parametrize("solver", slow_but(("pgs", "converged"), ("pgs", "soft_step", "converged")))
+@pytest.mark.parametrize("solver", slow_but(("pgs",), ("pgs", "soft_step", "converged")))
 def test_a_rod_that_can_not_reach_is_flagged(solver):
     """Feet 1 m apart, rods of 1 m: their ends are at most 3 m apart."""
     for length, flag in ((1.0, 0), (4.0, Flag.OPEN_LOOP)):
