@@ -292,20 +292,24 @@ def _add_at_filled_places(together: int, places: Places, matrix: Changes, veloci
     return by_platform(by_turns, in_one_kernel, velocity, places, matrix, velocity, impulse)
 
 
-@_add_at_filled_places.defjvp
 def _add_at_filled_places_jvp(together: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     places, matrix, velocity, impulse = primals
-    _, d_matrix, d_velocity, d_impulse = tangents
+    d_places, d_matrix, d_velocity, d_impulse = tangents
     leaves, structure = jax.tree.flatten((places.blocks, matrix, impulse))
-    changes = [*(None for _ in places.blocks), *jax.tree.leaves((d_matrix, d_impulse))]
+    changes = jax.tree.leaves((d_places.blocks, d_matrix, d_impulse), is_leaf=chunk_derivatives.is_zero)
 
     def of_turn(*leaves: Array) -> list[Array]:
         blocks, part, values = jax.tree.unflatten(structure, leaves)
         return [receive(jnp.zeros_like(velocity), blocks, part.changes(values, together))]
 
-    added = Chunked(of_turn, 0, impulse.shape[0], summed=True)
+    shape = jax.ShapeDtypeStruct(velocity.shape, velocity.dtype)
+    added = Chunked(of_turn, 0, impulse.shape[0], (shape,), summed=True)
     d_added = chunk_derivatives.tangents(added, leaves, places.turns, changes)[0]
-    return _add_at_filled_places(together, *primals), d_velocity + d_added
+    d_velocity = d_added if chunk_derivatives.is_zero(d_velocity) else d_velocity + d_added
+    return _add_at_filled_places(together, *primals), d_velocity
+
+
+_add_at_filled_places.defjvp(_add_at_filled_places_jvp, symbolic_zeros=True)
 
 
 def _all_turns(velocity: Array, blocks: tuple[tuple[int, ...], ...], together: int) -> Array:

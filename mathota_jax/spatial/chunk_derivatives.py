@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jax.core import ShapedArray
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -35,26 +36,25 @@ class Chunked:
       function: from the leaves of one chunk and those that all chunks share, constants first, to those of the result.
       constant_count: how many of the leaves are shared; the others have a leading axis of chunks.
       count: number of chunks.
+      of_one: shapes and types of what it gives for a chunk.
       summed: whether the results are added up instead of stacked.
     """
 
     function: Callable[..., list[Array]]
     constant_count: int
     count: int
+    of_one: Shapes
     summed: bool = False
 
-    def shapes(self, leaves: Sequence[Any]) -> Shapes:
+    @property
+    def shapes(self) -> Shapes:
         """What all chunks together give."""
         count = () if self.summed else (self.count,)
-        return tuple(jax.ShapeDtypeStruct((*count, *x.shape), x.dtype) for x in self._shapes_of_one(leaves))
+        return tuple(jax.ShapeDtypeStruct((*count, *x.shape), x.dtype) for x in self.of_one)
 
-    def _shapes_of_one(self, leaves: Sequence[Any]) -> Sequence[Any]:
-        return jax.eval_shape(lambda *leaves: self.function(*self.at(leaves, 0)), *leaves)
-
-    def at(self, leaves: Sequence[Any], k: Any) -> list[Any]:
-        """What the function gets of a chunk; `k` is a number, or a `counter`."""
-        row = counter.row if isinstance(k, Array) and k.ndim else lambda leaf, k: leaf[k]
-        return [leaf if place < self.constant_count else row(leaf, k) for place, leaf in enumerate(leaves)]
+    def at(self, leaves: Sequence[Array], k: Array) -> list[Array]:
+        """What the function gets of the chunk at a `counter`."""
+        return [*leaves[: self.constant_count], *counter.row(list(leaves[self.constant_count :]), k)]
 
     def joined(self, results: Sequence[Array], found: Sequence[Array], k: Array) -> list[Array]:
         """The results with what is found of a chunk."""
@@ -69,7 +69,7 @@ class Chunked:
             k, results = carry
             return counter.following(k), self.joined(results, self.function(*self.at(leaves, k)), k)
 
-        return lax.fori_loop(0, used, body, (counter.start(), _zeros(self.shapes(leaves))))[1]
+        return lax.fori_loop(0, used, body, (counter.start(), _zeros(self.shapes)))[1]
 
     def at_once(self, leaves: Sequence[Array], used: Array) -> list[Array]:
         """The same side by side."""
@@ -83,13 +83,12 @@ class Chunked:
 
     def one_by_one(self, leaves: Sequence[Array], used: Array) -> list[Array]:
         """The same in a loop over all chunks, which JAX can do anything with."""
-        shapes = self._shapes_of_one(leaves)
 
         def body(k: Array, chunk: Sequence[Array]) -> tuple[Array, list[Array]]:
             def evaluate(chunk: Sequence[Array]) -> list[Array]:
                 return self.function(*leaves[: self.constant_count], *chunk)
 
-            return k + 1, lax.cond(k < used, evaluate, lambda _: _zeros(shapes), chunk)
+            return k + 1, lax.cond(k < used, evaluate, lambda _: _zeros(self.of_one), chunk)
 
         found = lax.scan(body, jnp.zeros((), used.dtype), list(leaves[self.constant_count :]))[1]
         return [x.sum(0) for x in found] if self.summed else found
@@ -99,12 +98,15 @@ Evaluate = Callable[[Sequence[Array], Array], list[Array]]
 
 
 def tangents(chunked: Chunked, leaves: Sequence[Array], used: Array, changes: Sequence[Any]) -> list[Any]:
-    """Those of the results, by those of the leaves, which are of no number type where the leaves are not."""
-    mask = tuple(_is_real(leaf) for leaf in leaves)
-    linear = [change for change, real in zip(changes, mask, strict=True) if real]
-    found = iter(_tangents_p.bind(used, *leaves, *linear, chunked=chunked, mask=mask))
-    shapes = chunked.shapes(leaves)
-    return [next(found) if _is_real(x) else np.zeros(x.shape, jax.dtypes.float0) for x in shapes]
+    """Those of the results; `changes` are those of the leaves, or a `SymbolicZero` where there is none."""
+    mask = tuple(_is_real(leaf) and not is_zero(change) for leaf, change in zip(leaves, changes, strict=True))
+    found = iter(_tangents_p.bind(used, *leaves, *_selected(changes, mask), chunked=chunked, mask=mask))
+    return [next(found) if _is_real(x) else np.zeros(x.shape, jax.dtypes.float0) for x in chunked.shapes]
+
+
+def is_zero(change: Any) -> bool:
+    """Whether JAX knows that there is none."""
+    return isinstance(change, SymbolicZero)
 
 
 def _is_real(value: Any) -> bool:
@@ -116,7 +118,7 @@ def _zeros(shapes: Sequence[Any]) -> list[Array]:
 
 
 def _restricted(evaluate: Callable[..., list[Array]], leaves: Sequence[Array], mask: Sequence[bool]) -> Callable:
-    """The real results of a function of leaves by those in the mask."""
+    """The real results of a function of leaves, by those leaves in the mask."""
 
     def function(*linear: Array) -> list[Array]:
         replacements = iter(linear)
@@ -142,11 +144,14 @@ def _push(evaluate: str, *args: Array, chunked: Chunked, mask: tuple[bool, ...])
     return jax.jvp(of_leaves, _selected(leaves, mask), list(changes))[1]
 
 
-def _pull(evaluate: str, *args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
-    """The cotangents likewise."""
+def _pull(
+    evaluate: str, *args: Array, chunked: Chunked, mask: tuple[bool, ...], given: tuple[bool, ...]
+) -> list[Array]:
+    """The cotangents likewise, of the real results that are `given`."""
     used, leaves, cotangents = _split(args, mask)
-    of_leaves = _restricted(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask)
-    return list(jax.vjp(of_leaves, *_selected(leaves, mask))[1](list(cotangents)))
+    results = _restricted(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask)
+    pull = jax.vjp(lambda *linear: _selected(results(*linear), given), *_selected(leaves, mask))[1]
+    return list(pull(list(cotangents)))
 
 
 def _push_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
@@ -160,20 +165,19 @@ def _push_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> lis
         found = jax.jvp(of_leaves, _selected(chunk, mask), of_changes.at(list(changes), k))[1]
         return counter.following(k), chunked.joined(results, found, k)
 
-    shapes = [x for x in chunked.shapes(leaves) if _is_real(x)]
-    return lax.fori_loop(0, used, body, (counter.start(), _zeros(shapes)))[1]
+    return lax.fori_loop(0, used, body, (counter.start(), _zeros(_pushed(*args, chunked=chunked, mask=mask))))[1]
 
 
-def _pull_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
+def _pull_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...], given: tuple[bool, ...]) -> list[Array]:
     used, leaves, cotangents = _split(args, mask)
     constants = sum(mask[: chunked.constant_count])
 
     def body(_: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
         k, totals = carry
         chunk = chunked.at(leaves, k)
-        of_leaves = _restricted(lambda leaves: chunked.function(*leaves), chunk, mask)
-        given = list(cotangents) if chunked.summed else counter.row(list(cotangents), k)
-        found = jax.vjp(of_leaves, *_selected(chunk, mask))[1](given)
+        results = _restricted(lambda leaves: chunked.function(*leaves), chunk, mask)
+        pull = jax.vjp(lambda *linear: _selected(results(*linear), given), *_selected(chunk, mask))[1]
+        found = pull(list(cotangents) if chunked.summed else counter.row(list(cotangents), k))
         shared = [total + x for total, x in zip(totals[:constants], found[:constants], strict=True)]
         own = [counter.put(all_, x, k) for all_, x in zip(totals[constants:], found[constants:], strict=True)]
         return counter.following(k), shared + own
@@ -181,23 +185,29 @@ def _pull_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> lis
     return lax.fori_loop(0, used, body, (counter.start(), _zeros(_selected(leaves, mask))))[1]
 
 
-def _by_platform(in_loop: Callable, at_once: Callable, *args: Array, **params: Any) -> list[Array]:
-    """GPUs wait longer for the end of a loop to be known than for the work on what is empty."""
-    on_cpu, on_gpu = functools.partial(in_loop, **params), functools.partial(at_once, "at_once", **params)
-    return by_platform(on_cpu, on_gpu, jax.eval_shape(on_cpu, *args), *args)
+def _pushed(*_: Any, chunked: Chunked, mask: tuple[bool, ...]) -> list[Any]:
+    """What has the shapes of the tangents."""
+    return [x for x in chunked.shapes if _is_real(x)]
 
 
-def _primitive(name: str, in_loop: Callable, by_jax: Callable) -> Primitive:
+def _pulled(*args: Any, mask: tuple[bool, ...], **_: Any) -> list[Any]:
+    """What has the shapes of the cotangents."""
+    return _selected(_split(args, mask)[1], mask)
+
+
+def _primitive(name: str, in_loop: Callable, by_jax: Callable, like: Callable) -> Primitive:
     """One of both, whose own derivative is that of the loop over all chunks."""
     primitive = Primitive(name)
     primitive.multiple_results = True
-    evaluate = functools.partial(_by_platform, in_loop, by_jax)
     everywhere = functools.partial(by_jax, "one_by_one")
 
+    def evaluate(*args: Array, **params: Any) -> list[Array]:
+        # A GPU waits longer for the end of a loop to be known than for the work on what is empty.
+        on_cpu, on_gpu = functools.partial(in_loop, **params), functools.partial(by_jax, "at_once", **params)
+        return by_platform(on_cpu, on_gpu, like(*args, **params), *args)
+
     def abstract(*avals: Any, **params: Any) -> list[ShapedArray]:
-        arguments = (jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals)
-        found = jax.eval_shape(functools.partial(in_loop, **params), *arguments)
-        return [ShapedArray(x.shape, x.dtype) for x in found]
+        return [ShapedArray(x.shape, x.dtype) for x in like(*avals, **params)]
 
     def jvp(primals: Sequence[Array], changes: Sequence[Any], **params: Any) -> tuple[list[Array], list[Array]]:
         changes = [ad.instantiate_zeros(change) for change in changes]
@@ -220,12 +230,13 @@ def _transpose(cotangents: Sequence[Any], *args: Any, chunked: Chunked, mask: tu
     used, leaves, changes = _split(args, mask)
     unknown = iter([ad.is_undefined_primal(change) for change in changes])
     wanted = tuple(selected and next(unknown) for selected in mask)
-    given = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
-    found = iter(_cotangents_p.bind(used, *leaves, *given, chunked=chunked, mask=wanted))
+    given = tuple(type(cotangent) is not ad.Zero for cotangent in cotangents)
+    parameters = {"chunked": chunked, "mask": wanted, "given": given}
+    found = iter(_cotangents_p.bind(used, *leaves, *_selected(cotangents, given), **parameters))
     of_changes = [next(found) if ad.is_undefined_primal(change) else None for change in changes]
     return [None] * (1 + len(mask)) + of_changes
 
 
-_tangents_p = _primitive("chunk_tangents", _push_in_loop, _push)
-_cotangents_p = _primitive("chunk_cotangents", _pull_in_loop, _pull)
+_tangents_p = _primitive("chunk_tangents", _push_in_loop, _push, _pushed)
+_cotangents_p = _primitive("chunk_cotangents", _pull_in_loop, _pull, _pulled)
 ad.primitive_transposes[_tangents_p] = _transpose

@@ -47,7 +47,8 @@ def map_filled(function: Callable[[Any], Any], tree: Any, filled: Array) -> Any:
     def of_leaves(*leaves: Array) -> list[Array]:
         return eval_jaxpr(program.jaxpr, leaves[: len(constants)], *leaves[len(constants) :])
 
-    chunked = Chunked(of_leaves, len(constants), chunk_count)
+    shapes = tuple(jax.tree.leaves(result))
+    chunked = Chunked(of_leaves, len(constants), chunk_count, shapes)
     results = _map_chunks(chunked, [*constants, *leaves], -(-filled // size))
 
     def join(values: Array) -> Array:
@@ -61,14 +62,15 @@ def map_filled(function: Callable[[Any], Any], tree: Any, filled: Array) -> Any:
 def _map_chunks(chunked: Chunked, leaves: list[Array], used: Array) -> list[Array]:
     """The function of the chunks in use, stacked, and 0 elsewhere."""
     # A GPU waits longer for the end of a loop to be known than for the work on what is empty.
-    shapes = chunked.shapes(leaves)
-    return by_platform(chunked.in_loop, chunked.at_once, list(shapes), leaves, used)
+    return by_platform(chunked.in_loop, chunked.at_once, list(chunked.shapes), leaves, used)
 
 
-@_map_chunks.defjvp
 def _map_chunks_jvp(chunked: Chunked, primals: tuple, changes: tuple) -> tuple[list[Array], list[Any]]:
     leaves, used = primals
     return _map_chunks(chunked, leaves, used), tangents(chunked, leaves, used, changes[0])
+
+
+_map_chunks.defjvp(_map_chunks_jvp, symbolic_zeros=True)
 
 
 def _chunk_count(count: int) -> int:

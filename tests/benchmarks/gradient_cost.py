@@ -1,6 +1,6 @@
-"""Cost and memory of reverse mode: a slab that slides, a stack of five boxes, a chain of five links.
+"""Cost and memory of reverse mode: a slab that slides, stacks of five and of ten boxes, a chain of five links.
 
-    OMP_NUM_THREADS=1 python -m tests.benchmarks.gradient_cost [--scenes slide,stack,chain] [--only memory]
+    OMP_NUM_THREADS=1 python -m tests.benchmarks.gradient_cost [--scenes slide,stack,ten,chain] [--only memory]
 
 Writes ``results/gradient_cost.json`` and ``.md``: CPU time of value and gradient over that of the value, worlds side by
 side, interleaved in one process; and temporary memory of the gradient of a long rollout, from the compiler, plain and with
@@ -49,6 +49,7 @@ def chain(links: int) -> tuple[Any, Any]:
 SCENES = {
     "slide": lambda: slab_on_plane(velocity=(2.0, 0.0, 0.0), options=undamped(dt=DT)),
     "stack": lambda: box_stack(5, options=undamped(dt=DT)),
+    "ten": lambda: box_stack(10, options=undamped(dt=DT)),
     "chain": lambda: chain(5),
 }
 
