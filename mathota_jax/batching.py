@@ -33,7 +33,7 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 from mathota_jax.spatial.varying import as_varying, result_types
-from mathota_jax.spatial.world_parts import by_parts, part_size, parts_pay
+from mathota_jax.spatial.world_parts import by_parts, part_size, part_size_of_derivative, parts_pay
 
 
 @dataclasses.dataclass(frozen=True)
@@ -238,7 +238,12 @@ def _part_size(native: Native, args: Sequence[Any]) -> int:
     """Worlds of the parts into which a batch may be cut."""
     worlds = max(arg.shape[-1] for arg in args)
     primal, of_primal = _primal(native, args)
-    return part_size(worlds, of_primal) if primal.in_parts else worlds
+    if not primal.in_parts:
+        return worlds
+    size = part_size(worlds, of_primal)
+    if primal is native:
+        return size
+    return part_size_of_derivative(worlds, _traced(primal, _signatures(of_primal, size), _trace_context()), size)
 
 
 def _primal(native: Native, args: Sequence[Any]) -> tuple[TreeFunction, Sequence[Any]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Plane, SceneBuilder, step
-from mathota_jax.spatial.world_parts import FEWEST, LANES, MOST, by_parts, part_size
+from mathota_jax.spatial.world_parts import FEWEST, LANES, MOST, by_parts, part_size, part_size_of_derivative
 from tests.marks import slow_but
 from tests.scenes import repeat, undamped
 
@@ -139,6 +139,16 @@ def test_part_size(worlds, numbers):
         assert worlds <= -(-worlds // size) * size < worlds + 2 * size
     else:
         assert worlds < 1.5 * MOST
+
+
+@pytest.mark.parametrize(("kilobytes", "expected"), [(40, 256), (230, 256), (1000, 64), (10000, 64)])
+def test_derivatives_of_what_computes_much_go_in_smaller_parts(kilobytes, expected):
+    """As measured: a sliding box, five links, five stacked boxes; and a pile."""
+
+    program = jax.make_jaxpr(lambda x: jnp.sin(jnp.sin(x)))(jnp.zeros((125 * kilobytes, 256), jnp.float32))
+    assert part_size_of_derivative(1024, program, 256) == expected
+    assert part_size_of_derivative(1024, program, 64) == 64  # never larger than of the function
+    assert part_size_of_derivative(40, program, 40) == 40
 
 
 @pytest.mark.parametrize("worlds, size", [(96, 32), (100, 32), (33, 32)])
