@@ -31,8 +31,10 @@ def solve_once(rows: tuple[Rows, ...], by_error: tuple[Array, ...], right_side: 
     """
     weighted = [[_weigh(matrix, side) for side in group.jacobian] for group, matrix in zip(rows, by_error, strict=True)]
     # Joined with the worlds last, and stored: within the kernel that makes it, a transposition reads one number at a time.
-    products = [_products(group, sides) for group, sides in zip(rows, weighted, strict=True)]
-    columns = jnp.concatenate([_system(rows, products).swapaxes(0, 1), _vector(right_side)[None]])
+    total = _nothing(rows, max(side.shape[-1] for sides in weighted for side in sides))
+    for group, sides in zip(rows, compute_once(weighted, rows[0].bias), strict=True):
+        total = _add(group, total, sides)
+    columns = jnp.concatenate([_system(rows, total).swapaxes(0, 1), _vector(right_side)[None]])
     lu = lax.linalg.lu(materialize(columns).transpose(2, 1, 0))[0]
     found = lax.linalg.triangular_solve(lu[..., :-1], lu[..., -1:], left_side=True, lower=False)
     return _velocity(found[..., 0].T, right_side)
@@ -55,11 +57,18 @@ class Inverse(NamedTuple):
 def inverse(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], answer: Callable[[Slopes, Array], Array]) -> Inverse:
     """``G^-1``; the answers by the slopes of each group are the products (turn, row, column, world) of H with errors."""
 
-    def products(part: Rows, slope: Slopes) -> Array:
-        return _products(part, [jax.vmap(functools.partial(answer, slope), 2, 2)(side) for side in part.jacobian])
+    def weighted(part: Rows, slope: Slopes) -> list[Array]:
+        return [jax.vmap(functools.partial(answer, slope), 2, 2)(side) for side in part.jacobian]
 
-    found = [map_turns(products, group, slope) for group, slope in zip(rows, slopes, strict=True)]
-    return Inverse(compute_once(dense.inverse(_system(rows, found), rows[0].response[0].shape[2]), rows[0].bias))
+    known = jax.tree.leaves((slopes, [group.response for group in rows]))
+    total = _nothing(rows, max(leaf.shape[-1] for leaf in known))
+    for group, slope in zip(rows, slopes, strict=True):
+        if group.places is None:
+            total = _add(group, total, weighted(group, slope))
+        else:
+            products = map_turns(lambda part, slope: _products(part, weighted(part, slope)), group, slope)
+            total = _add_turn_by_turn(group, total, products)
+    return Inverse(compute_once(dense.inverse(_system(rows, total), rows[0].response[0].shape[2]), rows[0].bias))
 
 
 def _vector(velocity: Array) -> Array:
@@ -72,16 +81,27 @@ def _velocity(vector: Array, like: Array) -> Array:
     return vector.reshape(like.shape[1], like.shape[0], -1).swapaxes(0, 1)
 
 
-def _system(rows: tuple[Rows, ...], products: Sequence[Array]) -> Array:
-    """``G``, (n, n, world), from the `_products` of each group."""
+def _nothing(rows: tuple[Rows, ...], worlds: int) -> Array:
+    """(block and block', component, component', world) to add to."""
     count, components = rows[0].table.block_count, rows[0].response[0].shape[2]
-    worlds = max(product.shape[-1] for product in products)
-    total = jnp.zeros((count * count, components, components, worlds), rows[0].bias.dtype)
-    for group, product in zip(rows, products, strict=True):
-        total = _scatter(group, total, product)
+    return jnp.zeros((count * count, components, components, worlds), rows[0].bias.dtype)
+
+
+def _system(rows: tuple[Rows, ...], total: Array) -> Array:
+    """``G``, (n, n, world), from ``M^-1 J^T H J``."""
+    count, components, worlds = rows[0].table.block_count, *total.shape[2:]
     system = total.reshape(count, count, components, components, worlds).swapaxes(1, 2)
     size = count * components
     return jnp.eye(size, dtype=total.dtype)[..., None] - system.reshape(size, size, worlds)
+
+
+def _add(group: Rows, total: Array, weighted: Sequence[Array]) -> Array:
+    """Adds the responses of a group times its ``H J``, by side."""
+    blocks = _blocks(group)
+    for receiver, response in zip(blocks, group.response, strict=True):
+        for source, jacobian in zip(blocks, weighted, strict=True):
+            total = _scatter(group, total, receiver, source, response, jacobian)
+    return total
 
 
 def _blocks(group: Rows) -> tuple[Any, ...]:
@@ -96,31 +116,55 @@ def _weigh(matrix: Array, jacobian: Array) -> Array:
     return functools.reduce(jnp.add, terms)
 
 
-def _products(group: Rows, weighted: Sequence[Array]) -> Array:
-    """``M^-1 J^T`` of a side times ``H J`` of a side, (turn, constraint, sides, component, component', world)."""
+def _product(group: Rows, response: Array, jacobian: Array) -> Array:
+    """``M^-1 J^T`` of a side times ``H J`` of a side, (turn, constraint, component, component', world)."""
     together = group.table.together
-    of_sides = []
-    for response, jacobian in itertools.product(group.response, compute_once(list(weighted), group.bias)):
-        terms = [
-            response[:, row, :, None, point::together] * jacobian[:, row, None, :, point::together]
-            for point in range(together)
-            for row in range(jacobian.shape[1])
-        ]
-        of_sides.append(jnp.moveaxis(compute_once(functools.reduce(jnp.add, terms), group.bias), 3, 1))
-    return jnp.stack(of_sides, axis=2)
-
-
-def _scatter(group: Rows, total: Array, products: Array) -> Array:
-    """Adds the products of the constraints at their pairs of blocks."""
-    count = group.table.block_count
-    blocks = _blocks(group)
-    pairs = [
-        jnp.where((receiver < count) & (source < count), receiver * count + source, count * count)
-        for receiver, source in itertools.product(blocks, blocks)
+    of_points = [
+        functools.reduce(
+            jnp.add,
+            [
+                response[:, row, :, None, point::together] * jacobian[:, row, None, :, point::together]
+                for row in range(jacobian.shape[1])
+            ],
+        )
+        for point in range(together)
     ]
-    index = jnp.stack(pairs, axis=2)  # (turn, constraint, receiver and source, world)
+    product = functools.reduce(jnp.add, of_points)
+    return jnp.moveaxis(compute_once(product, product), 3, 1)
+
+
+def _scatter(group: Rows, total: Array, receiver: Array, source: Array, response: Array, jacobian: Array) -> Array:
+    """Adds the products of the constraints (turn, constraint) at their pairs of blocks."""
+    count, worlds = group.table.block_count, total.shape[-1]
+    product = _product(group, response, jacobian)
+    product = product.reshape(-1, *product.shape[2:])
+    index = _pair_of_blocks(count, receiver, source)
     if group.places is None:
-        return total.at[index.reshape(-1)].add(products.reshape(-1, *products.shape[3:]), mode="drop")
+        return total.at[index.reshape(-1)].add(product, mode="drop")
+    index = index.reshape(-1, index.shape[-1])
+    return jax.vmap(lambda t, i, p: t.at[i].add(p, mode="drop"), (-1, -1, -1), -1)(
+        total,
+        jnp.broadcast_to(index, (index.shape[0], worlds)),
+        jnp.broadcast_to(product, (*product.shape[:-1], worlds)),
+    )
+
+
+def _pair_of_blocks(count: int, receiver: Array, source: Array) -> Array:
+    """Number of a pair of blocks; one that does not exist where one of them does not."""
+    return jnp.where((receiver < count) & (source < count), receiver * count + source, count * count)
+
+
+def _products(group: Rows, weighted: Sequence[Array]) -> Array:
+    """`_product` of all pairs of sides, (turn, constraint, pair of sides, component, component', world)."""
+    sides = itertools.product(group.response, compute_once(list(weighted), group.bias))
+    return jnp.stack([_product(group, response, jacobian) for response, jacobian in sides], axis=2)
+
+
+def _add_turn_by_turn(group: Rows, total: Array, products: Array) -> Array:
+    """Adds the products of the turns in use, in all worlds at once, at the places of each."""
+    assert group.places is not None
+    pairs = itertools.product(group.places.blocks, group.places.blocks)
+    index = jnp.stack([_pair_of_blocks(group.table.block_count, *pair) for pair in pairs], axis=2)
     lanes = jnp.arange(total.shape[-1])
     index = jnp.broadcast_to(index, (*index.shape[:-1], len(lanes)))
     products = jnp.broadcast_to(products, (*products.shape[:-1], len(lanes)))
