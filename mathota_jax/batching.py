@@ -32,8 +32,9 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from mathota_jax.spatial.real_results import is_real, restricted
 from mathota_jax.spatial.varying import as_varying, result_types
-from mathota_jax.spatial.world_parts import by_parts, part_size, part_size_of_derivative, parts_pay
+from mathota_jax.spatial.world_parts import FEWEST, by_parts, part_size, part_size_of_derivative, parts_pay
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,8 +112,8 @@ class Pushforward:
         primals, tangents = list(args[: len(self.mask)]), list(args[len(self.mask) :])
         linear = [primal for primal, selected in zip(primals, self.mask, strict=True) if selected]
         pairs = [jnp.broadcast_arrays(primal, tangent) for primal, tangent in zip(linear, tangents, strict=True)]
-        restricted = _restricted(self.native, primals, self.mask)
-        return list(jax.jvp(restricted, [pair[0] for pair in pairs], [pair[1] for pair in pairs])[1])
+        of_linear = restricted(functools.partial(_run, self.native), primals, self.mask)
+        return list(jax.jvp(of_linear, [pair[0] for pair in pairs], [pair[1] for pair in pairs])[1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,8 +132,8 @@ class Pullback:
             for primal, selected in zip(primals, self.mask, strict=True)
             if selected
         ]
-        restricted = _restricted(self.native, primals, self.mask)
-        outputs, pull = jax.vjp(restricted, *linear)
+        of_linear = restricted(functools.partial(_run, self.native), primals, self.mask)
+        outputs, pull = jax.vjp(of_linear, *linear)
         return list(pull([_cotangent_of(output, c) for output, c in zip(outputs, cotangents, strict=True)]))
 
 
@@ -144,21 +145,6 @@ def _cotangent_of(output: Array, cotangent: Array) -> Array:
     """The cotangent in the shape of its output; one that all worlds share depends on nothing that is differentiated."""
     shared = output.shape[-1] < cotangent.shape[-1]
     return jnp.zeros_like(output) if shared else jnp.broadcast_to(cotangent, output.shape)
-
-
-def _restricted(native: Native, primals: list[Array], mask: tuple[bool, ...]) -> Callable[..., list[Array]]:
-    """The real outputs of `native` as a function of the inputs in `mask`."""
-
-    def function(*linear: Array) -> list[Array]:
-        replacements = iter(linear)
-        args = [next(replacements) if selected else primal for primal, selected in zip(primals, mask, strict=True)]
-        return [output for output in _run(native, args) if _is_real(output)]
-
-    return function
-
-
-def _is_real(value: Any) -> bool:
-    return jnp.issubdtype(value.dtype, jnp.inexact)
 
 
 Signature = tuple[tuple[int, ...], Any]
@@ -241,7 +227,7 @@ def _part_size(native: Native, args: Sequence[Any]) -> int:
     if not primal.in_parts:
         return worlds
     size = part_size(worlds, of_primal)
-    if primal is native:
+    if primal is native or worlds <= FEWEST:  # which can not be cut: the primal need not be traced for it
         return size
     return part_size_of_derivative(worlds, _traced(primal, _signatures(of_primal, size), _trace_context()), size)
 
@@ -324,7 +310,7 @@ def _jvp_rule(
 ) -> tuple[list[Array], list[Any]]:
     outputs = _call_p.bind(*primals, native=native, world_axes=world_axes)
     mask = tuple(
-        type(tangent) is not ad.Zero and _is_real(primal) for primal, tangent in zip(primals, tangents, strict=True)
+        type(tangent) is not ad.Zero and is_real(primal) for primal, tangent in zip(primals, tangents, strict=True)
     )
     selected = [tangent for tangent, wanted in zip(tangents, mask, strict=True) if wanted]
     zeros = [ad.Zero(jax.typeof(output).to_tangent_aval()) for output in outputs]
@@ -336,7 +322,7 @@ def _jvp_rule(
         native, kept = native.again(native.shortcut, jax.tree.unflatten(out_tree, outputs), primals)
         kept, mask = jax.lax.stop_gradient(kept), (False,) * len(kept) + mask
     real = iter(_linear_p.bind(*kept, *primals, *selected, native=native, mask=mask, world_axes=world_axes))
-    return outputs, [next(real) if _is_real(output) else zero for output, zero in zip(outputs, zeros, strict=True)]
+    return outputs, [next(real) if is_real(output) else zero for output, zero in zip(outputs, zeros, strict=True)]
 
 
 def _linear_evaluate(

@@ -58,7 +58,8 @@ def inverse(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], answer: Callable
     """``G^-1``; the answers by the slopes of each group are the products (turn, row, column, world) of H with errors."""
 
     def weighted(part: Rows, slope: Slopes) -> list[Array]:
-        return [jax.vmap(functools.partial(answer, slope), 2, 2)(side) for side in part.jacobian]
+        sides = [jax.vmap(functools.partial(answer, slope), 2, 2)(side) for side in part.jacobian]
+        return compute_once(sides, part.bias)  # each goes into the products with all sides
 
     known = jax.tree.leaves((slopes, [group.response for group in rows]))
     total = _nothing(rows, max(leaf.shape[-1] for leaf in known))
@@ -156,7 +157,7 @@ def _pair_of_blocks(count: int, receiver: Array, source: Array) -> Array:
 
 def _products(group: Rows, weighted: Sequence[Array]) -> Array:
     """`_product` of all pairs of sides, (turn, constraint, pair of sides, component, component', world)."""
-    sides = itertools.product(group.response, compute_once(list(weighted), group.bias))
+    sides = itertools.product(group.response, weighted)
     return jnp.stack([_product(group, response, jacobian) for response, jacobian in sides], axis=2)
 
 

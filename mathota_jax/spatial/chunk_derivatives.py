@@ -24,6 +24,7 @@ from jax.interpreters import ad, batching, mlir
 
 from mathota_jax.spatial import counter
 from mathota_jax.spatial.by_platform import by_platform
+from mathota_jax.spatial.real_results import OfLeaves, is_real, restricted
 
 Shapes = tuple[jax.ShapeDtypeStruct, ...]
 
@@ -94,14 +95,11 @@ class Chunked:
         return [x.sum(0) for x in found] if self.summed else found
 
 
-Evaluate = Callable[[Sequence[Array], Array], list[Array]]
-
-
 def tangents(chunked: Chunked, leaves: Sequence[Array], used: Array, changes: Sequence[Any]) -> list[Any]:
     """Those of the results; `changes` are those of the leaves, or a `SymbolicZero` where there is none."""
-    mask = tuple(_is_real(leaf) and not is_zero(change) for leaf, change in zip(leaves, changes, strict=True))
+    mask = tuple(is_real(leaf) and not is_zero(change) for leaf, change in zip(leaves, changes, strict=True))
     found = iter(_tangents_p.bind(used, *leaves, *_selected(changes, mask), chunked=chunked, mask=mask))
-    return [next(found) if _is_real(x) else np.zeros(x.shape, jax.dtypes.float0) for x in chunked.shapes]
+    return [next(found) if is_real(x) else np.zeros(x.shape, jax.dtypes.float0) for x in chunked.shapes]
 
 
 def is_zero(change: Any) -> bool:
@@ -109,23 +107,8 @@ def is_zero(change: Any) -> bool:
     return isinstance(change, SymbolicZero)
 
 
-def _is_real(value: Any) -> bool:
-    return jnp.issubdtype(value.dtype, jnp.inexact)
-
-
 def _zeros(shapes: Sequence[Any]) -> list[Array]:
     return [jnp.zeros(x.shape, x.dtype) for x in shapes]
-
-
-def _restricted(evaluate: Callable[..., list[Array]], leaves: Sequence[Array], mask: Sequence[bool]) -> Callable:
-    """The real results of a function of leaves, by those leaves in the mask."""
-
-    def function(*linear: Array) -> list[Array]:
-        replacements = iter(linear)
-        args = [next(replacements) if selected else leaf for leaf, selected in zip(leaves, mask, strict=True)]
-        return [result for result in evaluate(args) if _is_real(result)]
-
-    return function
 
 
 def _selected(leaves: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
@@ -137,11 +120,30 @@ def _split(args: Sequence[Any], mask: Sequence[bool]) -> tuple[Any, Sequence[Any
     return args[0], args[1 : 1 + len(mask)], args[1 + len(mask) :]
 
 
+def _pushed_through(
+    function: OfLeaves, leaves: Sequence[Array], mask: Sequence[bool], changes: Sequence[Array]
+) -> list[Array]:
+    """Tangents of the real results by those of the leaves in the mask."""
+    return jax.jvp(restricted(function, leaves, mask), _selected(leaves, mask), list(changes))[1]
+
+
+def _pulled_through(
+    function: OfLeaves,
+    leaves: Sequence[Array],
+    mask: Sequence[bool],
+    given: Sequence[bool],
+    cotangents: Sequence[Array],
+) -> list[Array]:
+    """Cotangents of the leaves in the mask by those of the real results that are `given`."""
+    results = restricted(function, leaves, mask)
+    pull = jax.vjp(lambda *linear: _selected(results(*linear), given), *_selected(leaves, mask))[1]
+    return list(pull(list(cotangents)))
+
+
 def _push(evaluate: str, *args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
     """The tangents by JAX's derivative of a method of `Chunked`."""
     used, leaves, changes = _split(args, mask)
-    of_leaves = _restricted(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask)
-    return jax.jvp(of_leaves, _selected(leaves, mask), list(changes))[1]
+    return _pushed_through(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask, changes)
 
 
 def _pull(
@@ -149,9 +151,7 @@ def _pull(
 ) -> list[Array]:
     """The cotangents likewise, of the real results that are `given`."""
     used, leaves, cotangents = _split(args, mask)
-    results = _restricted(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask)
-    pull = jax.vjp(lambda *linear: _selected(results(*linear), given), *_selected(leaves, mask))[1]
-    return list(pull(list(cotangents)))
+    return _pulled_through(lambda leaves: getattr(chunked, evaluate)(leaves, used), leaves, mask, given, cotangents)
 
 
 def _push_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> list[Array]:
@@ -160,9 +160,8 @@ def _push_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...]) -> lis
 
     def body(_: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
         k, results = carry
-        chunk = chunked.at(leaves, k)
-        of_leaves = _restricted(lambda leaves: chunked.function(*leaves), chunk, mask)
-        found = jax.jvp(of_leaves, _selected(chunk, mask), of_changes.at(list(changes), k))[1]
+        own = of_changes.at(changes, k)
+        found = _pushed_through(lambda chunk: chunked.function(*chunk), chunked.at(leaves, k), mask, own)
         return counter.following(k), chunked.joined(results, found, k)
 
     return lax.fori_loop(0, used, body, (counter.start(), _zeros(_pushed(*args, chunked=chunked, mask=mask))))[1]
@@ -174,10 +173,8 @@ def _pull_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...], given:
 
     def body(_: Array, carry: tuple[Array, list[Array]]) -> tuple[Array, list[Array]]:
         k, totals = carry
-        chunk = chunked.at(leaves, k)
-        results = _restricted(lambda leaves: chunked.function(*leaves), chunk, mask)
-        pull = jax.vjp(lambda *linear: _selected(results(*linear), given), *_selected(chunk, mask))[1]
-        found = pull(list(cotangents) if chunked.summed else counter.row(list(cotangents), k))
+        of_results = cotangents if chunked.summed else counter.row(list(cotangents), k)
+        found = _pulled_through(lambda chunk: chunked.function(*chunk), chunked.at(leaves, k), mask, given, of_results)
         shared = [total + x for total, x in zip(totals[:constants], found[:constants], strict=True)]
         own = [counter.put(all_, x, k) for all_, x in zip(totals[constants:], found[constants:], strict=True)]
         return counter.following(k), shared + own
@@ -187,7 +184,7 @@ def _pull_in_loop(*args: Array, chunked: Chunked, mask: tuple[bool, ...], given:
 
 def _pushed(*_: Any, chunked: Chunked, mask: tuple[bool, ...]) -> list[Any]:
     """What has the shapes of the tangents."""
-    return [x for x in chunked.shapes if _is_real(x)]
+    return [x for x in chunked.shapes if is_real(x)]
 
 
 def _pulled(*args: Any, mask: tuple[bool, ...], **_: Any) -> list[Any]:

@@ -109,10 +109,9 @@ def test_a_sum_over_the_chunks_in_use(used):
     def truth(rows, weight):
         return jnp.sum(weight * rows[:used] ** 2, axis=0)
 
-    def added(leaves):
-        return [leaves[0] * leaves[1] ** 2]
-
-    chunked = Chunked(lambda *leaves: added(leaves), 1, 5, (jax.ShapeDtypeStruct((3,), jnp.float32),), summed=True)
+    chunked = Chunked(
+        lambda weight, row: [weight * row**2], 1, 5, (jax.ShapeDtypeStruct((3,), jnp.float32),), summed=True
+    )
     leaves = [weight, rows]
     for way in (chunked.in_loop, chunked.at_once, chunked.one_by_one):
         np.testing.assert_allclose(way(leaves, jnp.int32(used))[0], truth(rows, weight), rtol=1e-6, atol=1e-7)
