@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import numbers
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
 
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -62,9 +65,19 @@ def check_leaves(label: str, model: Model, state: State) -> None:
     if not isinstance(model, Model) or not isinstance(state, State):
         kinds = f"{type(model).__name__} and {type(state).__name__}"
         raise ValueError(f"{label}: expected a Model and a State, in this order, got {kinds}")
+    precisions: dict[str, str] = {}
     for owner, value, shapes in (("state", state, STATE), ("model", model, MODEL)):
         for name, shape in shapes.items():
-            _check(label, f"{owner}.{name}", getattr(value, name), shape, model.scene)
+            leaf = getattr(value, name)
+            _check(label, f"{owner}.{name}", leaf, shape, model.scene)
+            if leaf is not None and not isinstance(leaf, float) and not getattr(leaf, "weak_type", False):
+                precisions.setdefault(str(jax.dtypes.canonicalize_dtype(leaf.dtype)), f"{owner}.{name}")
+    if len(precisions) > 1:
+        found = ", ".join(f"{name} is {precision}" for precision, name in precisions.items())
+        raise ValueError(
+            f"{label}: model and state must have one precision, but {found}; build both in it, or convert their "
+            "floating-point leaves (jax_enable_x64 makes new arrays float64)"
+        )
     kinds = [entry.kind for entry in model.scene.shapes]
     for kind, parameters in model.shapes.items():
         for name, leaf in parameters.items():
@@ -73,6 +86,28 @@ def check_leaves(label: str, model: Model, state: State) -> None:
                     f"{label}: model.shapes['{kind}']['{name}'] must have an entry for each {kind} of the scene, "
                     f"{kinds.count(kind)}, got shape {np.shape(leaf)}"
                 )
+
+
+def check_actions(label: str, model: Model, state: State, actions: Array | int) -> Array:
+    """(step, motor) actions in the precision of the state, also for a number of steps without effort.
+
+    Raises:
+      ValueError: a negative number of steps, or one that is traced, or actions of the wrong shape.
+    """
+    motor_count = len(model.scene.motors)
+    if isinstance(actions, numbers.Integral):
+        if isinstance(actions, bool) or actions < 0:
+            raise ValueError(f"{label}: the number of steps must be an integer of at least 0, got {actions}")
+        return jnp.zeros((int(actions), motor_count), state.position.dtype)
+    if isinstance(actions, Tracer) and actions.ndim == 0:
+        raise ValueError(
+            f"{label}: the number of steps must be known at compilation: jax.jit({label}, static_argnums=2), or a Python "
+            "integer inside of your own jitted function"
+        )
+    actions = jnp.asarray(actions, state.position.dtype)
+    if actions.ndim != 2 or actions.shape[1] != motor_count:
+        raise ValueError(f"{label}: actions must have shape (steps, {motor_count}), got {actions.shape}")
+    return actions
 
 
 def values_in_range(model: Model) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import numbers
 from typing import NamedTuple
 
 import jax
@@ -20,7 +19,7 @@ from mathota_jax.constraints.problem import Forces, constrain, known_impulses, s
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
-from mathota_jax.leaf_shapes import check_leaves, values_in_range
+from mathota_jax.leaf_shapes import check_actions, check_leaves, values_in_range
 from mathota_jax.model import Model
 from mathota_jax.outcome import end_forces, forces, new_state
 from mathota_jax.phases import (
@@ -84,7 +83,7 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
 
 
 def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, State]:
-    """Runs many steps in one `lax.scan`.
+    """Runs many steps in one `lax.scan`; compiled at the first call for a scene and a number of steps.
 
     Args:
       model: parameters and static scene.
@@ -96,17 +95,15 @@ def rollout(model: Model, state: State, actions: Array | int) -> tuple[State, St
       step k + 1. Differentiable like `step`; memory is linear in the number of steps.
 
     Raises:
-      ValueError: a negative number of steps, or actions of the wrong shape.
+      ValueError: a negative number of steps or a traced one, or actions of the wrong shape.
     """
     check_leaves("rollout", model, state)
-    motor_count = len(model.scene.motors)
-    if isinstance(actions, numbers.Integral):
-        if isinstance(actions, bool) or actions < 0:
-            raise ValueError(f"rollout: the number of steps must be an integer of at least 0, got {actions}")
-        actions = jnp.zeros((actions, motor_count), state.position.dtype)
-    actions = jnp.asarray(actions)
-    if actions.ndim != 2 or actions.shape[1] != motor_count:
-        raise ValueError(f"rollout: actions must have shape (steps, {motor_count}), got {actions.shape}")
+    return _run(model, state, check_actions("rollout", model, state, actions))
+
+
+@jax.jit
+def _run(model: Model, state: State, actions: Array) -> tuple[State, State]:
+    """Compiled once for each scene and number of steps, also where nothing around it is."""
 
     def body(state: State, action: Array) -> tuple[State, State]:
         state = step(model, state, action)

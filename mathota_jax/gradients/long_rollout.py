@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.gradients.clipping import clip_cotangent
+from mathota_jax.leaf_shapes import check_actions, check_leaves
 from mathota_jax.model import Model
 from mathota_jax.state import State
 from mathota_jax.step import step
@@ -54,16 +55,10 @@ def long_rollout(
       The final state, and what `observe` returned with a leading axis, entry k being that after step k + 1.
 
     Raises:
-      ValueError: a negative number of steps, actions of the wrong shape, or `segment` or `window` less than 1.
+      ValueError: a negative or traced number of steps, actions of the wrong shape, or `segment` or `window` less than 1.
     """
-    motor_count = len(model.scene.motors)
-    if isinstance(actions, int):
-        if actions < 0:
-            raise ValueError(f"long_rollout: the number of steps must be at least 0, got {actions}")
-        actions = jnp.zeros((actions, motor_count), state.position.dtype)
-    actions = jnp.asarray(actions, state.position.dtype)
-    if actions.ndim != 2 or actions.shape[1] != motor_count:
-        raise ValueError(f"long_rollout: actions must have shape (steps, {motor_count}), got {actions.shape}")
+    check_leaves("long_rollout", model, state)
+    actions = check_actions("long_rollout", model, state, actions)
     for name, value in (("segment", segment), ("window", window)):
         if value is not None and value < 1:
             raise ValueError(f"long_rollout: {name} must be at least 1 step, got {value}")

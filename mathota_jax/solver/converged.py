@@ -58,8 +58,13 @@ INEXACT = 0.3
 SLOW = 0.5
 """Share of the residual left by an outer step at which the stiffness grows."""
 
-PATIENCE = 4
-"""Slow outer steps in a row after which a residual that is acceptable is accepted: the stiffness grew at each."""
+PATIENCE, NEAR_PATIENCE, NEAR = 8, 3, 10.0
+"""Outer steps in a row without progress on the least residual after which one that is acceptable is accepted, and one
+that is within so many tolerances. What a world does after that is noise: its velocity drifts from its impulses, and all
+others wait. Measured on cold problems of four bodies and 14 contacts in float32: without a limit a tenth of them search
+to the end, and momentum is lost by 0.003 m/s (0.19 at a mass ratio of 1e4). So all end within 50 (150), and 0.0004
+(0.0006) is lost; four steps everywhere leave ten times the least residual in some. 64 worlds of four tumbling boxes: 19
+linear systems a step, 65 before."""
 
 FIRST_STIFFNESS, STIFFNESS_FACTOR, EASY_FACTOR = 10.0, 4.0, 10.0
 """The stiffness grows faster after an outer step that took a single Newton step."""
@@ -94,7 +99,7 @@ class _Search(NamedTuple):
       residual: after the last outer step.
       stiffness: of the laws.
       newton: Newton steps since the last outer step.
-      slow: outer steps in a row that hardly reduced the residual.
+      stalled: outer steps in a row that hardly reduced the least residual.
       done: whether the world is finished.
       count: () iterations.
     """
@@ -107,7 +112,7 @@ class _Search(NamedTuple):
     residual: Array
     stiffness: Array
     newton: Array
-    slow: Array
+    stalled: Array
     done: Array
     count: Array
 
@@ -232,7 +237,9 @@ class _Problem:
         factor = jnp.where(search.newton == 0, EASY_FACTOR, STIFFNESS_FACTOR)
         stiffness = jnp.where(harder, search.stiffness * factor, search.stiffness)
         stiffness = jnp.where(gives_up, search.stiffness / STIFFNESS_FACTOR, stiffness)
-        slow_steps = jnp.where(outer, jnp.where(slow, search.slow + 1, 0), search.slow)
+        stalled = jnp.where(residual > SLOW * search.least, search.stalled + 1, 0)
+        stalled = jnp.where(outer, stalled, search.stalled)
+        patience = jnp.where(search.least <= NEAR * self.tolerance, NEAR_PATIENCE, PATIENCE)
         better = residual < search.least
         new = _Search(
             velocity=found.velocity,
@@ -243,8 +250,8 @@ class _Problem:
             residual=jnp.where(outer, residual, search.residual),
             stiffness=jnp.clip(stiffness, 1.0, LARGEST_STIFFNESS[str(self.free.dtype)]),
             newton=jnp.where(outer, 0, search.newton + 1),
-            slow=slow_steps,
-            done=(residual <= self.tolerance) | ((slow_steps >= PATIENCE) & (search.least <= self.acceptable)),
+            stalled=stalled,
+            done=(residual <= self.tolerance) | ((stalled >= patience) & (search.least <= self.acceptable)),
             count=search.count + 1,
         )
         chosen = jax.tree.map(

@@ -77,59 +77,78 @@ def rows_of(jacobian, inverse_mass, friction):
     return tuple(rows)
 
 
-def solved(jacobian, inverse_mass, free, friction=None):
-    """Impulses (contact, row), velocity and flag by the converged solver, as float64 NumPy."""
-    rows = rows_of(jacobian, inverse_mass, friction)
+def solved(problems, friction=None):
+    """Impulses (world, contact, row), velocity (world, 6 bodies) and flags by the converged solver, as float64 NumPy."""
+    each = [rows_of(jacobian, inverse_mass, friction) for jacobian, inverse_mass, _ in problems]
+    rows = jax.tree.map(lambda *parts: jnp.concatenate(parts, -1), *each)
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
-    packed = jnp.asarray(free.reshape(BODIES, 6).T[..., None])
-    velocity, impulses, failed = jax.jit(converged.solve)(rows, packed, start)
-    found = np.zeros(jacobian.shape[:2])
+    free = jnp.asarray(np.stack([free.reshape(BODIES, 6).T for *_, free in problems], -1))
+    velocity, impulses, failed = jax.jit(converged.solve)(rows, free, start)
+    found = np.zeros((len(problems), *problems[0][0].shape[:2]))
     for group, impulse in zip(rows, impulses, strict=True):
-        values = np.moveaxis(np.asarray(impulse, float)[..., 0], 1, -1).reshape(-1, jacobian.shape[1])
+        values = np.moveaxis(np.asarray(impulse, float), (3, 0, 2), (0, 1, 2)).reshape(
+            len(problems), -1, found.shape[-1]
+        )
         real = group.table.order >= 0
-        found[group.table.order[real]] = values[real]
-    return found, np.asarray(velocity, float)[..., 0].T.reshape(-1), float(failed[0])
+        found[:, group.table.order[real]] = values[:, real]
+    return found, np.asarray(velocity, float).T.reshape(len(problems), -1), np.asarray(failed)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_frictionless_contacts_are_those_of_nnls(precision, seed, gate):
+def test_frictionless_contacts_are_those_of_nnls(precision, gate):
     """The velocity is the metric projection on the admissible ones (Gauss' principle), here by active sets (SciPy)."""
-    jacobian, inverse_mass, free = random_problem(seed, friction=False)
-    root = np.sqrt(inverse_mass)
-    truth = free + inverse_mass * (jacobian[:, 0].T @ nnls((jacobian[:, 0] * root).T, -free / root)[0])
-    impulses, velocity, failed = solved(jacobian, inverse_mass, free)
-    assert not failed
-    limit = {"float32": 1e-4, "float64": 1e-7}[str(precision)]
-    gate("velocity - truth, over the largest", (velocity - truth) / np.abs(truth).max(), limit)
+    problems = [random_problem(seed, friction=False) for seed in range(100)]
+    impulses, velocity, failed = solved(problems)
+    assert not failed.any()
     assert (impulses >= 0).all()
+    limit = {"float32": 1e-4, "float64": 1e-7}[str(precision)]
+    errors = []
+    for (jacobian, inverse_mass, free), found in zip(problems, velocity, strict=True):
+        root = np.sqrt(inverse_mass)
+        truth = free + inverse_mass * (jacobian[:, 0].T @ nnls((jacobian[:, 0] * root).T, -free / root)[0])
+        errors.append((found - truth) / np.abs(truth).max())
+    gate("velocity - truth, over the largest", errors, limit)
 
 
 @pytest.mark.parametrize("mass_ratio", [1.0, 1e4])
-@pytest.mark.parametrize("seed", range(6))
-def test_contact_laws_hold(precision, seed, mass_ratio, gate):
-    """The four residuals of a rigid contact (Le Lidec et al., "Contact models in robotics", 2024) are 0."""
+def test_contact_laws_hold(precision, mass_ratio, gate):
+    """The four residuals of a rigid contact (Le Lidec et al., "Contact models in robotics", 2024) are 0.
+
+    In many problems, since a search that wanders loses momentum in some. Velocities are beside the largest one that the free
+    motion could give a contact.
+    """
     friction = 0.5
-    jacobian, inverse_mass, free = random_problem(seed, friction=True, mass_ratio=mass_ratio)
-    impulses, velocity, failed = solved(jacobian, inverse_mass, free, friction)
-    assert not failed
-    speed = jacobian @ velocity
+    problems = [random_problem(seed, friction=True, mass_ratio=mass_ratio) for seed in range(200)]
+    found, velocities, failed = solved(problems, friction)
+    gate("share of worlds flagged", failed.mean(), 0.0 if mass_ratio == 1.0 else 0.01)
     limit = {"float32": 2e-3, "float64": 1e-6}[str(precision)]
-    size = np.abs(impulses).max()
+    residuals = [
+        residuals_of(problem, impulses, velocity, friction, np.finfo(precision).eps)
+        for problem, impulses, velocity, flag in zip(problems, found, velocities, failed, strict=True)
+        if not flag
+    ]
+    for name in residuals[0]:
+        gate(name, [each[name] for each in residuals], 1e-6 if name == "outside the cone" else limit)
+    assert (np.abs(found).max((1, 2)) > 0.1).all()
+
+
+def residuals_of(problem, impulses, velocity, friction, eps):
+    """How far an answer is from the laws, by name."""
+    jacobian, inverse_mass, free = problem
+    size, scale = np.abs(impulses).max(), (np.abs(jacobian) @ np.abs(free)).max()
+    speed = jacobian @ velocity / scale
     normal, tangential = impulses[:, 0], np.linalg.norm(impulses[:, 1:], axis=-1)
     # The velocity is solved for itself; of the impulses two units in the last place show in what they add up to.
     momentum = velocity - free - inverse_mass * np.einsum("krd,kr->d", jacobian, impulses)
-    last_place = np.finfo(precision).eps * inverse_mass * np.einsum("krd,kr->d", np.abs(jacobian), np.abs(impulses))
-    gate(
-        "momentum [m/s], beyond the last places of the impulses",
-        np.maximum(0, np.abs(momentum) - 2 * last_place),
-        limit,
-    )
-    gate("approach [m/s]", np.maximum(0, -speed[:, 0]), limit)
-    gate("complementarity", normal * speed[:, 0] / size, limit)
-    gate("outside the cone", np.maximum(0, tangential - friction * normal) / size, 1e-6)
+    sums = inverse_mass * np.einsum("krd,kr->d", np.abs(jacobian), np.abs(impulses))
     power = friction * normal * np.linalg.norm(speed[:, 1:], axis=-1) + (impulses[:, 1:] * speed[:, 1:]).sum(-1)
-    gate("dissipation gap", power / size, limit)
-    assert size > 0.1
+    return {
+        "momentum, beyond the last places of the impulses": np.maximum(0, np.abs(momentum) - 2 * eps * sums).max()
+        / scale,
+        "approach": np.maximum(0, -speed[:, 0]).max(),
+        "complementarity": np.abs(normal * speed[:, 0]).max() / size,
+        "outside the cone": np.maximum(0, tangential - friction * normal).max() / size,
+        "dissipation gap": np.abs(power).max() / size,
+    }
 
 
 @pytest.mark.slow
