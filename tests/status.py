@@ -99,7 +99,7 @@ FEATURES = (
     ),
     Feature("sleeping and islands", "mathota_jax.dynamics:sleep", "physics/test_sleep.py"),
     Feature("substepped soft contacts", "mathota_jax.solver:soft_step", "physics/test_soft_step.py"),
-    Feature("articulated trees", "mathota_jax.dynamics:articulated", "physics/test_articulated.py"),
+    Feature("reduced (joint) coordinates", "mathota_jax.dynamics:articulated", "physics/test_articulated.py"),
     Feature(
         "distance, manifold, time of impact of any two shapes", "mathota_jax:time_of_impact", "unit/test_queries.py"
     ),
@@ -107,6 +107,7 @@ FEATURES = (
     Feature("bodies that ignore each other", "mathota_jax:pair_filter", "unit/test_ignored_collisions.py"),
     Feature("raycast against every shape", "mathota_jax:raycast", "unit/test_raycast.py"),
     Feature("meshes (OBJ, STL), convex decomposition", "mathota_jax.io:meshes", "unit/test_meshes.py"),
+    Feature("pictures of every shape, replays in a browser", "mathota_envs.render:render_rgb", "envs/test_render.py"),
     Feature("MJCF and URDF", "mathota_jax.io:mjcf", "unit/test_mjcf.py"),
 )
 

@@ -122,6 +122,7 @@ def _json_shape(shape: dict[str, Any]) -> dict[str, Any]:
         "bounding_radius": "boundingRadius",
         "half_extents": "halfExtents",
         "half_height": "halfHeight",
+        "cell_size": "cellSize",
         "local_position": "localPosition",
         "local_orientation": "localOrientation",
     }

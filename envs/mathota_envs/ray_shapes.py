@@ -1,4 +1,4 @@
-"""Where a ray meets a shape: closed forms, one entry of `RAY_SHAPES` a kind.
+"""Where a ray meets a shape, one entry of `RAY_SHAPES` a kind: closed forms for the common ones, else the engine's own.
 
 Rays are component arrays of shape ``(ray,)``; a shape's pose and size are scalars that broadcast against them.
 """
@@ -8,14 +8,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mathota_jax.collision.rays import RAYS
+from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot
 
 
 class Placed(NamedTuple):
-    """A shape in the world: its sizes by name (scalars or `Vec3`), its body's position and rotation."""
+    """A shape in the world: its sizes by name, its body's position and rotation.
+
+    Sizes are scalars or `Vec3`; vertices are a `Vec3` of components ``(vertex,)`` with their faces ``(face, corner)``,
+    heights ``(row, column)``.
+    """
 
     size: dict[str, Any]
     position: Vec3
@@ -26,15 +33,41 @@ class RayShape(NamedTuple):
     """How one kind of shape is seen.
 
     Attributes:
-        distance: ``(origin, direction, placed) -> (ray,)`` distance [m] along unit directions to the entry point,
-            infinite where the ray misses or starts inside.
-        normal: ``(point, placed) -> Vec3`` outward unit normal at a surface point.
+        meet: ``(origin, direction, placed)`` to the distance ``(ray,)`` [m] along unit directions to the entry point,
+            infinite where the ray misses or starts inside, and the outward unit normal there.
         patterned: Whether to draw octants in two tones, which make the turning of a round shape visible.
     """
 
-    distance: Callable[[Vec3, Vec3, Placed], Array]
-    normal: Callable[[Vec3, Placed], Vec3]
+    meet: Callable[[Vec3, Vec3, Placed], tuple[Array, Vec3]]
     patterned: bool
+
+
+def _closed_form(
+    distance: Callable[[Vec3, Vec3, Placed], Array], normal: Callable[[Vec3, Placed], Vec3], patterned: bool
+) -> RayShape:
+    """A shape by the distance to its entry and the normal at a point of its surface."""
+
+    def meet(origin: Vec3, direction: Vec3, placed: Placed) -> tuple[Array, Vec3]:
+        entry = distance(origin, direction, placed)
+        return entry, normal(origin + direction * entry, placed)
+
+    return RayShape(meet, patterned)
+
+
+def _of_the_engine(kind: str, patterned: bool) -> RayShape:
+    """A shape by the engine's own rays, to which shapes and worlds are the last two axes: here one shape, and the rays."""
+
+    def meet(origin: Vec3, direction: Vec3, placed: Placed) -> tuple[Array, Vec3]:
+        size = {
+            name: values[None] if name == "faces" else jax.tree.map(lambda leaf: leaf[..., None, None], values)
+            for name, values in placed.size.items()
+        }
+        pose = jax.tree.map(lambda leaf: leaf[..., None, None], Pose(placed.position, placed.rotation))
+        start, heading = (vector.map(lambda c: c[None]) for vector in (origin, direction))
+        found = RAYS[kind](size, pose, start, heading)
+        return _entry(found.hit, found.distance)[0], found.normal.map(lambda c: c[0])
+
+    return RayShape(meet, patterned)
 
 
 def _entry(hit: Array, distance: Array) -> Array:
@@ -128,8 +161,12 @@ def plane_normal(point: Vec3, placed: Placed) -> Vec3:
 
 
 RAY_SHAPES = {
-    "sphere": RayShape(sphere_distance, sphere_normal, patterned=True),
-    "box": RayShape(box_distance, box_normal, patterned=False),
-    "capsule": RayShape(capsule_distance, capsule_normal, patterned=True),
-    "plane": RayShape(plane_distance, plane_normal, patterned=False),
+    "sphere": _closed_form(sphere_distance, sphere_normal, patterned=True),
+    "box": _closed_form(box_distance, box_normal, patterned=False),
+    "capsule": _closed_form(capsule_distance, capsule_normal, patterned=True),
+    "cylinder": _of_the_engine("cylinder", patterned=True),
+    "cone": _of_the_engine("cone", patterned=True),
+    "polyhedron": _of_the_engine("polyhedron", patterned=False),
+    "heightfield": _of_the_engine("heightfield", patterned=False),
+    "plane": _closed_form(plane_distance, plane_normal, patterned=False),
 }

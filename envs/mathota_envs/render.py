@@ -1,7 +1,7 @@
 """Pictures of a scene by a small ray caster in JAX: no window, no OpenGL, any backend.
 
-One primary and one shadow ray a pixel, analytic intersections (`ray_shapes`), Lambert shading with an ambient part, a
-chequered ground and a sky gradient. All per-pixel quantities are separate component arrays of shape ``(ray,)``, which
+One primary and one shadow ray a pixel, intersections with every shape (`ray_shapes`), Lambert shading with an ambient part,
+a chequered ground and a sky gradient. All per-pixel quantities are separate component arrays of shape ``(ray,)``, which
 XLA fuses into a few vectorised loops.
 """
 
@@ -18,7 +18,15 @@ from jax import Array
 
 from mathota_envs.camera import Camera, default_camera, validated
 from mathota_envs.ray_shapes import RAY_SHAPES, Placed
-from mathota_envs.scene_description import BOUNDING_RADIUS, PLANE_COLOUR, body_colours, grid_cell
+from mathota_envs.scene_description import (
+    BOUNDING_RADIUS,
+    GROUND,
+    GROUND_COLOUR,
+    body_colours,
+    by_component,
+    grid_cell,
+)
+from mathota_jax.geometry.hull import padded_faces
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
 
@@ -103,7 +111,10 @@ def render(model: Any, state: Any, camera: Camera, width: int, height: int) -> A
             )
     sizes = {kind: dict(model.shapes[kind]) for kind in RAY_SHAPES if any(shape.kind == kind for shape in shapes)}
     arrays = (sizes, model.gravity, state.position, state.orientation, camera)
-    return _render(shapes, *jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), arrays), width=width, height=height)
+    sizes, *others = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), arrays)
+    if "polyhedron" in sizes:
+        sizes["polyhedron"]["faces"] = jnp.asarray(padded_faces(model.scene.faces))
+    return _render(shapes, sizes, *others, width=width, height=height)
 
 
 @partial(jax.jit, static_argnames=("shapes", "width", "height"))
@@ -160,9 +171,8 @@ def _groups(
             center = center + to_matrix(turn).apply(Vec3(*size.pop("local_position").T))
         if "local_orientation" in size:
             turn = multiply(turn, Quaternion(*size.pop("local_orientation").T))
-        size = {name: Vec3(*values.T) if values.ndim == 2 else values for name, values in size.items()}
-        placed = Placed(size, center, to_matrix(turn))
-        tint = [PLANE_COLOUR if kind == "plane" else colours[shape.body] for shape in members]
+        placed = Placed(by_component(size), center, to_matrix(turn))
+        tint = [GROUND_COLOUR if kind in GROUND else colours[shape.body] for shape in members]
         groups.append(_Group(kind, len(members), placed, _linear(Vec3(*jnp.array(tint).T))))
     return groups
 
@@ -220,14 +230,15 @@ def _first_hit(groups: list[_Group], eye: Vec3, ray: Vec3, pixel_angle: Array, v
         kind, shape = group.kind, RAY_SHAPES[group.kind]
 
         def update(nearest: _Surface, placed: Placed, colour: Vec3, kind: str = kind, shape: Any = shape) -> _Surface:
-            distance = shape.distance(eye, ray, placed)
+            distance, normal = shape.meet(eye, ray, placed)
             closer = distance < nearest.distance
             point = eye + ray * distance
-            normal = shape.normal(point, placed)
             haze = nothing
-            if kind == "plane":
+            if kind in GROUND:
                 footprint = distance * pixel_angle / jnp.maximum(-dot(normal, ray), 1e-6)
-                colour = colour * _chequer(point, placed, cell, footprint)
+                axes = tangent_basis(placed.size["normal"]) if kind == "plane" else _level_axes(placed)
+                colour = colour * _chequer(point, axes, cell, footprint)
+            if kind == "plane":
                 haze = 1.0 - 1.0 / (1.0 + (distance / (12.0 * view_distance)) ** 2)
             elif shape.patterned:
                 colour = colour * _octants(point, placed)
@@ -248,9 +259,14 @@ def _octants(point: Vec3, placed: Placed) -> Array:
     return jnp.where(local.x * local.y * local.z > 0, 1.0, 0.6)
 
 
-def _chequer(point: Vec3, placed: Placed, cell: Array, footprint: Array) -> Array:
-    """Brightness of the squares of a plane; fades to their mean where a pixel is as large as a square."""
-    first, second = tangent_basis(placed.size["normal"])
+def _level_axes(placed: Placed) -> tuple[Vec3, Vec3]:
+    """Axes of a heightfield's grid."""
+    return placed.rotation.column_x, placed.rotation.column_z
+
+
+def _chequer(point: Vec3, axes: tuple[Vec3, Vec3], cell: Array, footprint: Array) -> Array:
+    """Brightness of the squares along two axes; fades to their mean where a pixel is as large as a square."""
+    first, second = axes
     parity = jnp.floor(dot(point, first) / cell) + jnp.floor(dot(point, second) / cell)
     contrast = jnp.clip(1.5 - 1.5 * footprint / cell, 0.0, 1.0)
     return 0.85 + 0.15 * contrast * jnp.where(jnp.mod(parity, 2.0) < 0.5, 1.0, -1.0)
@@ -261,10 +277,10 @@ def _shadowed(groups: list[_Group], start: Vec3, light: Vec3) -> Array:
     blocked = jnp.zeros(start.x.shape, bool)
     for group in groups:
         if group.kind != "plane":
-            distance = RAY_SHAPES[group.kind].distance
+            meet = RAY_SHAPES[group.kind].meet
 
-            def update(blocked: Array, placed: Placed, _: Vec3, distance: Any = distance) -> Array:
-                return blocked | (distance(start, light, placed) < jnp.inf)
+            def update(blocked: Array, placed: Placed, _: Vec3, meet: Any = meet) -> Array:
+                return blocked | (meet(start, light, placed)[0] < jnp.inf)
 
             blocked = _over(group, update, blocked)
     return blocked

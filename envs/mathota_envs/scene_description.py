@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from mathota_jax.spatial.vector import Vec3, dot
 
 PALETTE = (
     (0.25, 0.53, 0.80),
@@ -22,20 +25,38 @@ PALETTE = (
 )
 """Colours (sRGB, 0 to 1) of the bodies, in the order in which they first own a bounded shape."""
 
-PLANE_COLOUR = (0.62, 0.64, 0.67)
+GROUND, GROUND_COLOUR = ("plane", "heightfield"), (0.62, 0.64, 0.67)
+"""Kinds that are ground to the others, drawn in squares."""
+
+
+def _height_radius(size: dict[str, Any]) -> Any:
+    rows, columns = size["heights"].shape[-2:]
+    half = 0.5 * math.hypot(rows - 1, columns - 1) * size["cell_size"]
+    return (half**2 + (size["heights"] ** 2).max((-2, -1))) ** 0.5
+
 
 BOUNDING_RADIUS = {
     "sphere": lambda size: size["radius"],
-    "box": lambda size: sum(extent * extent for extent in size["half_extents"]) ** 0.5,
+    "box": lambda size: dot(size["half_extents"], size["half_extents"]) ** 0.5,
     "capsule": lambda size: size["radius"] + size["half_height"],
+    "cylinder": lambda size: (size["radius"] ** 2 + size["half_height"] ** 2) ** 0.5,
+    "cone": lambda size: (size["radius"] ** 2 + (1.5 * size["half_height"]) ** 2) ** 0.5,
+    "polyhedron": lambda size: (dot(size["vertices"], size["vertices"]) ** 0.5).max(-1),
+    "heightfield": _height_radius,
     "plane": lambda size: math.inf,
 }
-"""Radius [m] about the body origin that encloses a shape, by kind; for floats as for traced arrays."""
+"""Radius [m] about the body origin that encloses a shape, by kind, from `by_component` of its sizes."""
+
+
+def by_component(size: dict[str, Any]) -> dict[str, Any]:
+    """Sizes, NumPy or JAX, whose vectors (last axis) are each a `Vec3`."""
+    vectors = ("half_extents", "normal", "vertices")
+    return {name: Vec3(*(v[..., k] for k in range(3))) if name in vectors else v for name, v in size.items()}
 
 
 def body_colours(shapes: Iterable[Any]) -> dict[int, tuple[float, float, float]]:
     """Colour of every body that owns a bounded shape, from the entries of ``model.scene.shapes``."""
-    bodies = dict.fromkeys(shape.body for shape in shapes if shape.kind != "plane")
+    bodies = dict.fromkeys(shape.body for shape in shapes if shape.kind not in GROUND)
     return {body: PALETTE[order % len(PALETTE)] for order, body in enumerate(bodies)}
 
 
@@ -50,7 +71,8 @@ def scene_description(model: Any) -> list[dict[str, Any]]:
         One dictionary a shape: ``kind``, ``body``, ``colour`` (sRGB, 0 to 1), ``bounding_radius`` [m] about the
         centre of mass of the body (infinite for a plane) and the sizes of its kind [m], such as ``radius`` or
         ``half_extents``, as floats or lists of floats; also ``local_position`` [m] and ``local_orientation``
-        (quaternion) of the shape in the body where a compound has them.
+        (quaternion) of the shape in the body where a compound has them, and ``triangles`` (vertex indices, seen
+        counter-clockwise from outside) of a polyhedron.
 
     Raises:
         ValueError: A shape is of a kind that cannot be drawn.
@@ -64,18 +86,27 @@ def scene_description(model: Any) -> list[dict[str, Any]]:
                 f"known kinds are {', '.join(sorted(BOUNDING_RADIUS))}"
             )
         sizes = model.shapes[shape.kind]
-        size = {name: np.asarray(values, dtype=float)[shape.index].tolist() for name, values in sizes.items()}
+        size = {name: np.asarray(values, dtype=float)[shape.index] for name, values in sizes.items()}
         offset = math.hypot(*size.get("local_position", (0.0,)))
+        radius = offset + float(BOUNDING_RADIUS[shape.kind](by_component(size)))
+        size = {name: values.tolist() for name, values in size.items()}
+        if shape.kind == "polyhedron":
+            size["triangles"] = [fan for face in model.scene.faces[shape.index] for fan in _fan(face)]
         description.append(
             {
                 "kind": shape.kind,
                 "body": int(shape.body),
-                "colour": PLANE_COLOUR if shape.kind == "plane" else colours[shape.body],
-                "bounding_radius": offset + BOUNDING_RADIUS[shape.kind](size),
+                "colour": GROUND_COLOUR if shape.kind in GROUND else colours[shape.body],
+                "bounding_radius": radius,
                 **size,
             }
         )
     return description
+
+
+def _fan(face: tuple[int, ...]) -> list[list[int]]:
+    """Triangles of a convex polygon."""
+    return [[int(face[0]), int(a), int(b)] for a, b in itertools.pairwise(face[1:])]
 
 
 def foreground(description: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -12,12 +12,19 @@ from scipy.spatial.transform import Rotation
 
 from mathota_envs.camera import Camera, default_camera
 from mathota_envs.render import _render, render, render_rgb
-from mathota_jax import Box, Capsule, Compound, Plane, SceneBuilder, Sphere
+from mathota_jax import Box, Capsule, Compound, Cone, Cylinder, Heightfield, Plane, Polyhedron, SceneBuilder, Sphere
 
 WIDTH, HEIGHT = 160, 120
 FIELD_OF_VIEW = math.radians(50.0)
 FLOOR = Plane(normal=(0, 1, 0), offset=0.0)
-SHAPES = {"sphere": Sphere(0.4), "box": Box((0.5, 0.3, 0.2)), "capsule": Capsule(0.2, 0.5)}
+SHAPES = {
+    "sphere": Sphere(0.4),
+    "box": Box((0.5, 0.3, 0.2)),
+    "capsule": Capsule(0.2, 0.5),
+    "cylinder": Cylinder(0.3, 0.4),
+    "cone": Cone(0.4, 0.4),
+    "polyhedron": Polyhedron(np.random.default_rng(2).uniform(-0.5, 0.5, (12, 3))),
+}
 
 
 def build(*bodies, gravity=(0, -9.8, 0)):
@@ -74,13 +81,30 @@ def silhouette(model, state, camera, body):
     return np.abs(image - empty).sum(-1) > 0
 
 
+def corners_of(shape):
+    """Points whose hull is the shape, to a thousandth of a pixel; None for balls and rows of balls."""
+    angle = np.linspace(0, 2 * np.pi, 2000)
+    circle = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], -1)
+    match shape:
+        case Box():
+            signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            return signs * shape.half_extents
+        case Cylinder():
+            return np.concatenate([shape.radius * circle + [0, y, 0] for y in (-shape.half_height, shape.half_height)])
+        case Cone():
+            h = shape.half_height
+            return np.concatenate([shape.radius * circle - [0, 0.5 * h, 0], [[0, 1.5 * h, 0]]])
+        case Polyhedron():
+            return shape.vertices - shape.mass_properties().center_of_mass
+    return None
+
+
 def expected_silhouette(kind, position, quaternion, camera):
     position = np.asarray(position)
     rotation = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
-    if kind == "box":
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        corners = position + (signs * SHAPES["box"].half_extents) @ rotation.T
-        hull = ConvexHull(project(camera, corners))
+    corners = corners_of(SHAPES[kind])
+    if corners is not None:
+        hull = ConvexHull(project(camera, position + corners @ rotation.T))
         row, column = np.mgrid[:HEIGHT, :WIDTH]
         sides = hull.equations[:, :2] @ np.stack([column.ravel(), row.ravel()]) + hull.equations[:, 2:]
         return (sides < 0).all(0).reshape(HEIGHT, WIDTH)
@@ -115,6 +139,33 @@ def test_silhouettes_are_the_pinhole_projections(kind):
         assert truth.sum() > 100
         # float32 may decide a pixel differently only where the edge passes through its centre.
         assert (seen != truth).sum() <= 2
+
+
+def test_terrain_is_seen_as_its_triangles():
+    """From above all slopes a surface covers the projections of its triangles, and hides nothing of itself."""
+    heights = np.random.default_rng(4).uniform(-0.2, 0.2, (4, 5))
+    builder = SceneBuilder(gravity=(0, -9.8, 0))
+    builder.add_body(Heightfield(heights, 0.4), static=True, position=(0.1, 0.3, -0.2))
+    builder.add_body(Sphere(0.1), mass=1.0, position=(0, -60, 0))
+    model, state = builder.build()
+    camera = Camera((0.6, 5.0, 0.3), (0.0, 0.3, 0.0), (0, 0, 1), FIELD_OF_VIEW)
+    i, j = np.mgrid[:4, :5]
+    points = np.stack([(i - 1.5) * 0.4 + 0.1, heights + 0.3, (j - 2) * 0.4 - 0.2], -1)
+    row, column = np.mgrid[:HEIGHT, :WIDTH]
+    truth = np.zeros((HEIGHT, WIDTH), bool)
+    for cell in np.ndindex(3, 4):
+        low, high = np.array(cell), np.array(cell) + 1
+        for other in ((cell[0], high[1]), (high[0], cell[1])):
+            corners = project(camera, [points[tuple(low)], points[other], points[tuple(high)]])
+            sides = ConvexHull(corners).equations
+            truth |= (
+                (sides[:, :2] @ np.stack([column.ravel(), row.ravel()]) + sides[:, 2:] <= 1e-9)
+                .all(0)
+                .reshape(HEIGHT, WIDTH)
+            )
+    seen = silhouette(model, state, camera, 0)
+    assert truth.sum() > 1000
+    assert (seen != truth).sum() <= 4
 
 
 def test_a_compound_looks_like_its_shapes_each_at_its_place():
@@ -299,7 +350,7 @@ def test_a_body_that_is_not_finite_is_left_out():
 @pytest.mark.parametrize("size", [(160, 120), (60, 150)])
 def test_default_view_shows_every_body_from_the_open_side(bodies, gravity, size):
     place = [(-0.7, 0.4, 0.3), (0.8, 0.2, -0.5), (0.1, 0.9, 0.0)]
-    small = [(SHAPES[kind], {"position": at}) for kind, at in zip(SHAPES, place, strict=True)]
+    small = [(SHAPES[kind], {"position": at}) for kind, at in zip(("sphere", "box", "capsule"), place, strict=True)]
     model, state = build(*bodies, *small, gravity=gravity)
     camera = default_camera(model, state, size[0] / size[1])
     directions = np.random.default_rng(0).normal(size=(500, 3))

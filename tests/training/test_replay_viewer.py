@@ -24,12 +24,17 @@ def evaluate(expression, *scripts):
 
 
 RADIUS, HALF = 0.3, 0.5
+TETRAHEDRON = [[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]]
 VOLUMES = {
     "sphere": ({"radius": RADIUS}, 4 / 3 * math.pi * RADIUS**3),
     "box": ({"halfExtents": [0.1, 0.2, 0.4]}, 8 * 0.1 * 0.2 * 0.4),
     "capsule": ({"radius": RADIUS, "halfHeight": HALF}, math.pi * RADIUS**2 * (2 * HALF + 4 / 3 * RADIUS)),
     "cylinder": ({"radius": RADIUS, "halfHeight": HALF}, 2 * math.pi * RADIUS**2 * HALF),
     "cone": ({"radius": RADIUS, "halfHeight": HALF}, 2 / 3 * math.pi * RADIUS**2 * HALF),
+    "polyhedron": (
+        {"vertices": [[3, -1, -1], [-1, 3, -1], [-1, -1, 3], [-1, -1, -1]], "triangles": TETRAHEDRON},
+        4**3 / 6,
+    ),
 }
 
 
@@ -150,6 +155,26 @@ def test_parts_of_compounds_are_placed_in_their_body():
     # The part turns x to y and shifts to (1, 1, 0); the body turns x to -z.
     assert point == pytest.approx([0, 1, 4, 1], abs=1e-12)
     assert nowhere == [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def test_terrain_is_the_surface_that_the_engine_stands_on():
+    """Triangles of the grid as `Heightfield` documents it, and outward normals: the volume below a surface is known."""
+    heights = np.random.default_rng(0).uniform(0.5, 1.5, (3, 4))
+    mesh = evaluate(f"heightfieldMesh({json.dumps(heights.tolist())}, 0.5)", "vectors.js", "meshes.js")
+    points, triangles = np.array(mesh["points"]), np.array(mesh["triangles"])
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    areas = 0.5 * np.cross(b - a, c - a)[:, 1]
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(2 * 3 * 0.5**2)
+    weights = np.zeros((3, 4))
+    for i in range(2):
+        for j in range(3):
+            weights[[i, i, i + 1], [j, j + 1, j + 1]] += 1  # below and above the diagonal of the cell
+            weights[[i, i + 1, i + 1], [j, j + 1, j]] += 1
+    below = (areas * (a + b + c)[:, 1] / 3).sum()
+    assert below == pytest.approx((weights * heights).sum() / 3 * 0.5**2 / 2)
+    assert points.min(0)[[0, 2]] == pytest.approx([-0.5, -0.75])
+    assert np.array(mesh["normals"])[:, 1].min() > 0
 
 
 def test_the_whole_script_parses():

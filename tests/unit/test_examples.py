@@ -46,6 +46,7 @@ def test_there_is_an_example_for_each_reader():
         "fitting",
         "batches",
         "robots",
+        "pictures",
     }
 
 

@@ -75,6 +75,34 @@ function boxMesh([x, y, z]) {
   return mesh;
 }
 
+/** Flat facets of a solid: the corners of each triangle are its own, so that edges show. */
+function facetMesh(points, triangles) {
+  const mesh = { points: [], normals: [], triangles: [], octants: false };
+  for (const [a, b, c] of triangles.map((corners) => corners.map((corner) => points[corner]))) {
+    const start = mesh.points.length;
+    const normal = normalize(cross(subtract(b, a), subtract(c, a)));
+    mesh.points.push(a, b, c);
+    mesh.normals.push(normal, normal, normal);
+    mesh.triangles.push([start, start + 1, start + 2]);
+  }
+  return mesh;
+}
+
+/** Surface over a grid centred at the origin: rows along x, columns along z, cells cut from (i, j) to (i + 1, j + 1). */
+function heightfieldMesh(heights, cellSize) {
+  const [rows, columns] = [heights.length, heights[0].length];
+  const points = heights.flatMap((row, i) =>
+    row.map((height, j) => [(i - (rows - 1) / 2) * cellSize, height, (j - (columns - 1) / 2) * cellSize]),
+  );
+  const triangles = [];
+  for (let i = 0; i + 1 < rows; i++)
+    for (let j = 0; j + 1 < columns; j++) {
+      const corner = i * columns + j;
+      triangles.push([corner, corner + 1, corner + columns + 1], [corner, corner + columns + 1, corner + columns]);
+    }
+  return facetMesh(points, triangles);
+}
+
 const MESHES = {
   sphere: (shape) => sphereMesh(shape.radius),
   box: (shape) => boxMesh(shape.halfExtents),
@@ -82,4 +110,6 @@ const MESHES = {
   cylinder: (shape) => cylinderMesh(shape.radius, -shape.halfHeight, shape.halfHeight),
   // The origin of a cone is its centroid, a quarter of the height above the base.
   cone: (shape) => coneMesh(shape.radius, -0.5 * shape.halfHeight, 1.5 * shape.halfHeight),
+  polyhedron: (shape) => facetMesh(shape.vertices, shape.triangles),
+  heightfield: (shape) => heightfieldMesh(shape.heights, shape.cellSize),
 };
