@@ -15,6 +15,7 @@ import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -54,18 +55,20 @@ class Contact(NamedTuple):
       time: [s] of the first contact; that up to which there is none if none was found.
       hit: bool, the shapes touch then.
       searched: bool, the search ended with a contact or with the duration, not with its limit.
+      found: closest points at that time.
     """
 
     time: Array
     hit: Array
     searched: Array
+    found: Nearest
 
 
 def first_contact(a: Mover, b: Mover, nearest: Callable[[Array], Nearest], duration: Array, touching: Array) -> Contact:
     """First time within the duration at which the gap is at most `touching` [m].
 
     Args:
-      a: the first mover, not differentiated.
+      a: the first mover; the search is not differentiable.
       b: the second one.
       nearest: closest points at a time.
       duration: [s].
@@ -83,6 +86,7 @@ class _Advance(NamedTuple):
     time: Array
     hit: Array
     done: Array
+    last: tuple[Array, Nearest]
 
 
 def _advance(
@@ -91,18 +95,27 @@ def _advance(
     """Contact of convex shapes, by safe steps."""
 
     def advance(state: _Advance) -> _Advance:
-        found = nearest(state.time)
+        found = _everywhere(nearest(state.time), start)
         gap = found.separation - touching
         ahead = jnp.minimum(state.time + _safe_step(a, b, state.time, found, gap), duration)
         late = state.time >= duration
         # A step that the clock does not resolve leaves no gap either.
         code = settle(jnp.where((gap <= 0) | ((ahead <= state.time) & ~late), 2.0, jnp.where(late, 1.0, 0.0)))
-        return _Advance(state.turn + 1, jnp.where(code > 0.5, state.time, ahead), code > 1.5, code > 0.5)
+        time = jnp.where(code > 0.5, state.time, ahead)
+        return _Advance(state.turn + 1, time, code > 1.5, code > 0.5, (state.time, found))
 
-    no = start > 0
-    state = _Advance(jnp.zeros((), jnp.int32), start, no, no)
+    no, nowhere = start > 0, Vec3(start, start, start)
+    last = start, Nearest(start, nowhere, nowhere, nowhere, no)
+    state = _Advance(jnp.zeros((), jnp.int32), start, no, no, last)
     state = lax.while_loop(lambda s: (s.turn < TURNS) & ~jnp.all(s.done), advance, state)
-    return Contact(state.time, state.hit, state.done)
+    # Evaluated once more, the closest points would be compiled once more.
+    return Contact(state.last[0], state.hit, state.done, state.last[1])
+
+
+def _everywhere(found: Nearest, like: Array) -> Nearest:
+    """In every world, and with a word about convergence."""
+    converged = jnp.ones(like.shape, bool) if found.converged is None else found.converged
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, like.shape), found._replace(converged=converged))
 
 
 def _safe_step(a: Mover, b: Mover, time: Array, found: Nearest, gap: Array) -> Array:
@@ -176,4 +189,5 @@ def _sample(
     state = _Sample(jnp.zeros((), jnp.int32), start, overlap, jnp.isfinite(overlap))
     state = lax.while_loop(lambda s: (s.turn < SAMPLES) & ~jnp.all(s.done), advance, state)
     hit = jnp.isfinite(state.overlap) & state.done
-    return Contact(jnp.where(hit, state.overlap, state.free), hit, state.done)
+    time = jnp.where(hit, state.overlap, state.free)
+    return Contact(time, hit, state.done, _everywhere(nearest(time), start))

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jax.core import Tracer
 
-from mathota_jax.advancement import Mover, first_contact
+from mathota_jax.advancement import Contact, Mover, first_contact
 from mathota_jax.batching import batch_last
 from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.manifold import Manifold, Nearest
@@ -323,26 +323,41 @@ def _impact(
     duration: Array,
 ) -> Impact:
     movers = _mover(a, pose_a, motion_a), _mover(b, pose_b, motion_b)
-    duration = duration[None]
-    frozen = lax.stop_gradient(movers)
-    touching = 16.0 * jnp.finfo(duration.dtype).eps * jnp.minimum(*(mover.reach for mover in frozen))
-
-    def nearest(movers: tuple[Mover, Mover], time: Array) -> Nearest:
-        return _nearest(movers[0].geometry, movers[0].at(time), movers[1].geometry, movers[1].at(time))
-
-    time, hit, searched = first_contact(
-        *frozen, functools.partial(nearest, frozen), lax.stop_gradient(duration), touching
-    )
-    found = nearest(movers, time)
-    # One Newton step of the root's time: no change of the value, the exact derivative (implicit function theorem).
-    rate = lax.stop_gradient(_approach(*frozen, time, lax.stop_gradient(found)))
-    touches = hit & (time > 0) & (rate < 0)
-    shift = jnp.where(touches, found.separation / jnp.where(touches, rate, 1.0), 0.0)
-    shift = shift - lax.stop_gradient(shift)
-    # A miss ends with the duration, whatever the shapes.
-    time = jnp.where(hit, time - shift, jnp.where(searched, duration, time))
-    distance = _natural(nearest(movers, time))
+    time, hit, searched, found = _first_impact(movers, duration[None])
+    distance = _natural(found)
     return Impact(time[0], hit[0], distance._replace(converged=distance.converged & searched[0]))
+
+
+_Movers = tuple[Mover, Mover]
+
+
+def _nearest_at(movers: _Movers, time: Array) -> Nearest:
+    """The closest points at a time."""
+    return _nearest(movers[0].geometry, movers[0].at(time), movers[1].geometry, movers[1].at(time))
+
+
+@jax.custom_jvp
+def _first_impact(movers: _Movers, duration: Array) -> Contact:
+    """The first contact, differentiably."""
+    touching = 16.0 * jnp.finfo(duration.dtype).eps * jnp.minimum(*(mover.reach for mover in movers))
+    return first_contact(*movers, functools.partial(_nearest_at, movers), duration, touching)
+
+
+@_first_impact.defjvp
+def _first_impact_jvp(primals: tuple, tangents: tuple) -> tuple:
+    """The time is that of the root of the gap (implicit function theorem); a miss ends with the duration."""
+    (movers, duration), (d_movers, d_duration) = primals, tangents
+    contact = time, hit, searched, found = _first_impact(movers, duration)
+    _, change = jax.linearize(_nearest_at, movers, time)
+    rate = _approach(movers[0], movers[1], time, found)
+    touches = hit & (time > 0) & (rate < 0)
+    d_gap = change(d_movers, jnp.zeros_like(time)).separation
+    d_contact = jnp.where(touches, -d_gap / jnp.where(touches, rate, 1.0), 0.0)
+    d_time = jnp.where(hit, d_contact, jnp.where(searched, d_duration, 0.0))
+    d_found = change(d_movers, d_time)
+    unmoved: Any = np.zeros(time.shape, jax.dtypes.float0)
+    d_found = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, time.shape), d_found._replace(converged=None))
+    return contact, Contact(d_time, unmoved, unmoved, d_found._replace(converged=unmoved))
 
 
 def _mover(geometry: Geometry, pose: NaturalPose, motion: NaturalPose) -> Mover:

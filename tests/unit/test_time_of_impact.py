@@ -20,6 +20,28 @@ def test_two_balls_meet(precision, gate):
     gate("gap", found.distance.separation, 20 * limit)
 
 
+def test_first_and_second_derivatives_of_balls_that_meet_askew(float64, gate):
+    """The lesser root of ``|p + v t| = 1`` in closed form; and the normal there, which is ``p + v t``."""
+
+    def searched(x):
+        found = time_of_impact(
+            Sphere(0.6), at(0, 0, 0), STILL, Sphere(0.4), (x[:3], at(0, 0, 0)[1]), (x[3:], np.zeros(3)), 3.0
+        )
+        return jnp.concatenate([found.time[None], found.distance.normal])
+
+    def known(x):
+        p, v = x[:3], x[3:]
+        a, b, c = v @ v, p @ v, p @ p - 1.0
+        time = (-b - jnp.sqrt(b * b - a * c)) / a
+        return jnp.concatenate([time[None], p + v * time])
+
+    x = jnp.array([2.0, 0.3, -0.2, -1.5, 0.1, 0.3])
+    gate("value", searched(x) - known(x), 1e-12)
+    gate("forward mode", jax.jacfwd(searched)(x) - jax.jacfwd(known)(x), 1e-9)
+    gate("reverse mode", jax.jacrev(searched)(x) - jax.jacrev(known)(x), 1e-9)
+    gate("second derivatives", jax.hessian(searched)(x) - jax.hessian(known)(x), 1e-8)
+
+
 def test_rod_swings_onto_a_plane(float64, gate):
     """The end of a turning rod, L sin(omega t) below its centre, reaches the plane below: rotation alone closes the gap."""
     length, radius, height, rate = 1.0, 0.05, 0.5, 2.0
