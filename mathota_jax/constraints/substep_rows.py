@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import functools
 
@@ -15,6 +16,7 @@ from mathota_jax.constraints.assembly import pack_scalars, smaller_side
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.joint import JointMotion
+from mathota_jax.constraints.joint_layout import joint_groups
 from mathota_jax.constraints.joints.rows import HOLD, STOP
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -62,7 +64,16 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
         one_sided=jnp.asarray(laws == STOP).reshape(shape) if (laws == STOP).any() else None,
         curvature=curvature,
         force=_force_laws(scene, rows, model, motion, laws.reshape(shape)),
+        branches=jnp.asarray(branches[slots]).reshape(shape) if (branches := _branches(scene)).any() else None,
     )
+
+
+def _branches(scene: Scene) -> np.ndarray:
+    """(slot,) whether each joint row belongs to a joint of a moving body that has more than two."""
+    ends = [(joint.parent, joint.child) for joint in scene.joints]
+    counts = collections.Counter(body for end in ends for body in end if not scene.static[body])
+    branches = np.array([max(counts[body] for body in end) > 2 for end in ends])
+    return np.concatenate([np.tile(branches[list(group.joints)], group.row_count) for group in joint_groups(scene)])
 
 
 def _force_laws(scene: Scene, rows: Rows, model: Model, motion: JointMotion, laws: np.ndarray) -> ForceLaws | None:

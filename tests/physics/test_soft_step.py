@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Flag, Hinge, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
+from mathota_jax import Box, Fixed, Flag, Hinge, Options, Plane, SceneBuilder, Sphere, is_asleep, rollout
 from tests.benchmarks.hard_scenes import chain, joint_gaps, overlapping_pyramid
 from tests.gradients.test_bounce_gradient import UNDER_GRAVITY, check
 from tests.gradients.test_bounce_gradient import run as bounce
@@ -242,6 +242,25 @@ def test_ball_and_chain_holds(gate):
     model, state = chain(40, damped(), end_mass=4021.0)
     _, record = recorded(model, state, 600)
     gate("joint gap / link", joint_gaps(record["position"], record["orientation"], 40), 0.01)
+
+
+def test_a_shelf_of_welded_boxes_stays_on_its_wall(gate):
+    """Two boxes on the sides of a third, which hangs on a wall: over-relaxed welds threw them apart within a second."""
+    builder = SceneBuilder(gravity=DOWN)
+    wall = builder.add_body(Box((0.1, 0.1, 0.1)), static=True, position=(0, 2, 0))
+    hub = builder.add_body(Box((0.1, 0.1, 0.1)), mass=5.0, position=(0, 1.7, 0))
+    builder.add_joint(Fixed(wall, hub, anchor=(0, 1.85, 0)))
+    for x in (-0.3, 0.3):
+        side = builder.add_body(Box((0.1, 0.1, 0.1)), mass=5.0, position=(x, 1.7, 0))
+        builder.add_joint(Fixed(hub, side, anchor=(0.5 * x, 1.7, 0)))
+    model, state = builder.build(soft())
+    final, record = recorded(model, state, 120)
+    gate(
+        "moved [m], which from a cold start it sags by",
+        record["position"][:, 1:] - np.asarray(state.position)[1:],
+        5e-3,
+    )
+    gate("speed at the end [m/s]", final.velocity, 1e-3)
 
 
 # Laws of joints, against the closed forms of `test_joint_drives` -----------------------------------------------------
