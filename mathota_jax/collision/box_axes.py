@@ -16,6 +16,8 @@ EDGE_DEPTH_SHARE = 0.05
 """An edge must besides be shallower than the face by this share of the depth."""
 FADE_GAP = 1e-2
 """Gap, as a share of the size, at which the preference is gone: separated boxes report their true axis."""
+ROUND_OFFS = 64.0
+"""Round-offs of size and gap by which it must win in any case."""
 FIRST_EDGE = 6
 
 
@@ -103,5 +105,10 @@ def best_axis(c: list[list[Array]], t: Vec3, t_b: Vec3, half_a: Vec3, half_b: Ve
 
 
 def preference_margin(separation: Array, size: Any) -> Array:
-    """By how much [m] a less preferred feature must win; fades to nothing as the gap opens."""
-    return REFERENCE_MARGIN * jnp.clip(size - jnp.maximum(separation, 0.0) / FADE_GAP, 0.0)
+    """By how much [m] a less preferred feature must win; fades to round-off as the gap opens.
+
+    Not to nothing: boxes turned about one axis have pairs of edges whose axis is that of a face, and one corner of that face
+    is no contact for it.
+    """
+    round_off = ROUND_OFFS * jnp.finfo(separation.dtype).eps * (size + jnp.abs(separation))
+    return REFERENCE_MARGIN * jnp.clip(size - jnp.maximum(separation, 0.0) / FADE_GAP, 0.0) + round_off

@@ -41,8 +41,11 @@ STEPS_OF_ONE = {"float32": 7, "float64": 16}
 stick. Measured for a slab that slides: six leave 1e-5, eight 2e-6. In float64 the derivatives of 60 steps forwards and
 backwards, which would be equal, differ by 7e-7 with ten, by 8e-9 with fourteen, by 1e-10 with sixteen."""
 
-DELTA = {"float32": 1e-3, "float64": 1e-6}
-"""Beside 1; in float32 round-off makes the first step wrong by some 1e-7 over its square."""
+DELTA = 1e-3
+"""Beside 1; in float32 round-off makes the first step wrong by some 1e-7 over its square. In float64 it could be less, were
+the rows of points that slide as redundant as they should be: where gaps of 1e-6 m do not fit one another, impulses take what
+does not fit over delta, and friction makes velocities of them. With 1e-6 a ball that slides on a sliding box had derivatives
+of 100 by the height of the box (0.56 in truth, 0.68 with 1e-3)."""
 
 FEW_BODIES = 10
 """Moving bodies up to which the default solver's derivatives are the solution. Measured beside 15 linear sweeps, which leave
@@ -86,7 +89,6 @@ class _System:
     def __init__(self, rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], like: Impulses) -> None:
         self.rows, self.slopes = rows, slopes
         self.swapped = tuple(dataclasses.replace(group, matrix=Dense(group.response, group.jacobian)) for group in rows)
-        self.delta = DELTA[str(like[0].dtype)]
         shape = rows[0].response[0].shape[2], rows[0].table.block_count, max(part.shape[-1] for part in like)
         self.nothing = jnp.zeros(shape, like[0].dtype)
 
@@ -134,7 +136,7 @@ class _System:
 
     def nearly(self, inverse: velocity_system.Inverse, residual: Impulses) -> Impulses:
         """``(A + delta)^-1`` times the residual."""
-        settled = tuple(slope.resolve(part, self.delta) for slope, part in zip(self.slopes, residual, strict=True))
+        settled = tuple(slope.resolve(part, DELTA) for slope, part in zip(self.slopes, residual, strict=True))
         settled = self.once(settled)
         velocity = self.once(inverse.solve(self.once(add_impulses(self.rows, self.nothing, settled))))
         return tuple(
@@ -145,19 +147,19 @@ class _System:
     def nearly_back(self, inverse: velocity_system.Inverse, residual: Impulses) -> Impulses:
         """Its transpose times the same."""
         passed = tuple(
-            slope.transposed(slope.resolve_back(part, self.delta))[1]
+            slope.transposed(slope.resolve_back(part, DELTA))[1]
             for slope, part in zip(self.slopes, residual, strict=True)
         )
         pushed = self.once(add_impulses(self.swapped, self.nothing, self.once(passed)))
         velocity = self.once(inverse.solve_back(pushed))
         return tuple(
-            slope.resolve_back(part + rates(group, velocity), self.delta)
+            slope.resolve_back(part + rates(group, velocity), DELTA)
             for slope, part, group in zip(self.slopes, residual, self.swapped, strict=True)
         )
 
     def _answer(self, slope: Slopes, error: Array) -> Array:
         """``S`` times errors."""
-        return slope.resolve(slope.update(jnp.zeros_like(error), error), self.delta)
+        return slope.resolve(slope.update(jnp.zeros_like(error), error), DELTA)
 
 
 class _Way(NamedTuple):

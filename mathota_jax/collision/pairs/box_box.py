@@ -51,8 +51,7 @@ def box_box(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) ->
     apart = _closest_points(frame, crossing, size)
 
     # Separated, and the axis of the test is not the direction of the closest points: then those.
-    round_off = 64.0 * jnp.finfo(t.x.dtype).eps * (size + jnp.abs(apart.depth))
-    gap_grows = apart.separation > apart.depth + preference_margin(apart.depth, size) + round_off
+    gap_grows = apart.separation > apart.depth + preference_margin(apart.depth, size)
     face_misses = (clipped.code[0] < 0) | ((apart.depth > 0) & gap_grows)
     edge_misses = crossing.clamped & (crossing.separation > 0)
     # What slot 0 holds: 0 a clipped point, 1 an edge crossing, 2 closest points of separated boxes,
