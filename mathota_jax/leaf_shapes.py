@@ -68,10 +68,9 @@ def check_leaves(label: str, model: Model, state: State) -> None:
     precisions: dict[str, str] = {}
     for owner, value, shapes in (("state", state, STATE), ("model", model, MODEL)):
         for name, shape in shapes.items():
-            leaf = getattr(value, name)
-            _check(label, f"{owner}.{name}", leaf, shape, model.scene)
-            if leaf is not None and not isinstance(leaf, float) and not getattr(leaf, "weak_type", False):
-                precisions.setdefault(str(jax.dtypes.canonicalize_dtype(leaf.dtype)), f"{owner}.{name}")
+            precision = _check(label, f"{owner}.{name}", getattr(value, name), shape, model.scene)
+            if precision is not None:
+                precisions.setdefault(precision, f"{owner}.{name}")
     if len(precisions) > 1:
         found = ", ".join(f"{name} is {precision}" for precision, name in precisions.items())
         raise ValueError(
@@ -122,9 +121,10 @@ def values_in_range(model: Model) -> Array:
     return functools.reduce(jnp.logical_and, each, jnp.ones(1, bool))
 
 
-def _check(label: str, name: str, leaf: Any, symbolic: tuple, scene: Scene) -> None:
+def _check(label: str, name: str, leaf: Any, symbolic: tuple, scene: Scene) -> str | None:
+    """The precision of a leaf; None where it takes that of the others."""
     if leaf is None:
-        return
+        return None
     if isinstance(leaf, list | tuple):
         raise ValueError(f"{label}: {name} must be an array, got a {type(leaf).__name__}")
     counts = {BODY: scene.body_count, JOINT: len(scene.joints), MOTOR: len(scene.motors)}
@@ -135,3 +135,6 @@ def _check(label: str, name: str, leaf: Any, symbolic: tuple, scene: Scene) -> N
     number = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
     if number.kind in "biu":
         raise ValueError(f"{label}: {name} must be floating point, got {number}")
+    if isinstance(leaf, float) or getattr(leaf, "weak_type", False):
+        return None
+    return str(jax.dtypes.canonicalize_dtype(number))

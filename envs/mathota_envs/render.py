@@ -19,13 +19,13 @@ from jax import Array
 from mathota_envs.camera import Camera, default_camera, validated
 from mathota_envs.ray_shapes import RAY_SHAPES, Placed
 from mathota_envs.scene_description import (
-    BOUNDING_RADIUS,
     GROUND,
     GROUND_COLOUR,
     body_colours,
     by_component,
     grid_cell,
 )
+from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.geometry.hull import padded_faces
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
 from mathota_jax.spatial.vector import Vec3, cross, dot, normalize, tangent_basis, where
@@ -222,7 +222,7 @@ def _sky(rise: Array) -> Vec3:
 
 
 def _first_hit(groups: list[_Group], eye: Vec3, ray: Vec3, pixel_angle: Array, view_distance: Array) -> _Surface:
-    radii = [BOUNDING_RADIUS[group.kind](group.placed.size) for group in groups if group.kind != "plane"]
+    radii = [jax.vmap(partial(bounding_radius, g.kind))(g.placed.size) for g in groups if g.kind != "plane"]
     cell = grid_cell(jnp.concatenate(radii) if radii else jnp.zeros(0))
     nothing = jnp.zeros_like(ray.x)
     nearest = _Surface(nothing + jnp.inf, Vec3(nothing, nothing, nothing), Vec3(nothing, nothing, nothing), nothing)

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mathota_jax.spatial.vector import Vec3, dot
+from mathota_jax.geometry import SHAPES
+from mathota_jax.geometry.bounds import bounding_radius
+from mathota_jax.spatial.vector import Vec3
 
 PALETTE = (
     (0.25, 0.53, 0.80),
@@ -27,25 +29,6 @@ PALETTE = (
 
 GROUND, GROUND_COLOUR = ("plane", "heightfield"), (0.62, 0.64, 0.67)
 """Kinds that are ground to the others, drawn in squares."""
-
-
-def _height_radius(size: dict[str, Any]) -> Any:
-    rows, columns = size["heights"].shape[-2:]
-    half = 0.5 * math.hypot(rows - 1, columns - 1) * size["cell_size"]
-    return (half**2 + (size["heights"] ** 2).max((-2, -1))) ** 0.5
-
-
-BOUNDING_RADIUS = {
-    "sphere": lambda size: size["radius"],
-    "box": lambda size: dot(size["half_extents"], size["half_extents"]) ** 0.5,
-    "capsule": lambda size: size["radius"] + size["half_height"],
-    "cylinder": lambda size: (size["radius"] ** 2 + size["half_height"] ** 2) ** 0.5,
-    "cone": lambda size: (size["radius"] ** 2 + (1.5 * size["half_height"]) ** 2) ** 0.5,
-    "polyhedron": lambda size: (dot(size["vertices"], size["vertices"]) ** 0.5).max(-1),
-    "heightfield": _height_radius,
-    "plane": lambda size: math.inf,
-}
-"""Radius [m] about the body origin that encloses a shape, by kind, from `by_component` of its sizes."""
 
 
 def by_component(size: dict[str, Any]) -> dict[str, Any]:
@@ -80,15 +63,15 @@ def scene_description(model: Any) -> list[dict[str, Any]]:
     colours = body_colours(model.scene.shapes)
     description = []
     for shape in model.scene.shapes:
-        if shape.kind not in BOUNDING_RADIUS:
+        if shape.kind not in SHAPES:
             raise ValueError(
                 f"shape kind {shape.kind!r} of body {shape.body} cannot be drawn: "
-                f"known kinds are {', '.join(sorted(BOUNDING_RADIUS))}"
+                f"known kinds are {', '.join(sorted(SHAPES))}"
             )
         sizes = model.shapes[shape.kind]
         size = {name: np.asarray(values, dtype=float)[shape.index] for name, values in sizes.items()}
         offset = math.hypot(*size.get("local_position", (0.0,)))
-        radius = offset + float(BOUNDING_RADIUS[shape.kind](by_component(size)))
+        radius = offset + float(bounding_radius(shape.kind, size))
         size = {name: values.tolist() for name, values in size.items()}
         if shape.kind == "polyhedron":
             size["triangles"] = [fan for face in model.scene.faces[shape.index] for fan in _fan(face)]

@@ -56,6 +56,7 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
         curvature = packed(jnp.where(curved[:, None], take(motion.turning, slots), 0.0))
     linear = jax.tree.leaves((motion.start.parent.linear, motion.start.child.linear))
     moves = functools.reduce(jnp.logical_or, [take(part, slots) != 0 for part in linear])
+    branches = _branches(scene)[slots]
     radius = pack_scalars(table, [_smallest_radius(scene, rows, model)], worlds)
     limit = PUSH_OUT_RATE * jnp.where(pack_scalars(table, [moves.astype(radius.dtype)], worlds) > 0, radius, 1.0)
     return PositionError(
@@ -64,7 +65,7 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
         one_sided=jnp.asarray(laws == STOP).reshape(shape) if (laws == STOP).any() else None,
         curvature=curvature,
         force=_force_laws(scene, rows, model, motion, laws.reshape(shape)),
-        branches=jnp.asarray(branches[slots]).reshape(shape) if (branches := _branches(scene)).any() else None,
+        branches=jnp.asarray(branches).reshape(shape) if branches.any() else None,
     )
 
 
