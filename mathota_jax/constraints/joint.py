@@ -79,7 +79,7 @@ def _rows(
         mass = decoupling.mass
         jacobians, responses = decoupling.sides(jacobians), decoupling.sides(responses)
     slots = np.maximum(table.order, 0)
-    laws, curved, angular = (values[slots] for values in (motion.start.laws, motion.start.curved, motion.start.angular))
+    laws, angular = (values[slots] for values in (motion.start.laws, motion.start.angular))
     error, rate, coefficients = select(table, (motion.start.error, motion.start.rate, motion.coefficients))
     felt = mass if motion.responses is None else _with_trees(scene, slots, mass, motion.responses)
     # An error turned into velocity whips a chain that starts open, and feeds a loop that can not close without bound. The
@@ -93,8 +93,8 @@ def _rows(
         return _by_law(laws, {law: getattr(response, name) for law, response in found.items()})
 
     bias = of_each("bias")
-    if motion.turning is not None and curved.any():
-        bias = bias + jnp.where(curved[:, None], select(table, motion.turning), 0.0)
+    if motion.turning is not None:
+        bias = bias + select(table, motion.turning)
     if decoupling is not None:
         bias = decoupling.rows(bias)
     worlds = max(jnp.shape(value)[-1] for value in (mass, error, *coefficients.values()))

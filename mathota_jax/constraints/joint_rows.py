@@ -49,7 +49,7 @@ class JointRows(NamedTuple):
       parent, child: Jacobians.
       error: what the law of each row acts on.
       rate: the Jacobian times the velocities.
-      laws, curved, angular: (slot,) law; whether the direction of the row turns; whether the error is an angle.
+      laws, angular: (slot,) law; whether the error is an angle.
     """
 
     parent: Side
@@ -57,7 +57,6 @@ class JointRows(NamedTuple):
     error: Array
     rate: Array
     laws: np.ndarray
-    curved: np.ndarray
     angular: np.ndarray
 
 
@@ -93,7 +92,6 @@ def joint_rows(model: Model, bodies: Bodies) -> JointRows:
         error=error,
         rate=rate,
         laws=np.repeat([row.law for row in rows], counts),
-        curved=np.repeat([row.curved for row in rows], counts),
         angular=np.repeat(angular, counts),
     )
 
@@ -109,8 +107,7 @@ def rows_of(model: Model, group: JointGroup, frames: JointFrames) -> list[JointR
             rows.append(kind.swing_row(frames, take(model.joint_swing, group.joints)))
         elif feature in ("damping", "friction"):
             law = VISCOUS if feature == "damping" else DRY
-            curved = kind.coordinate is None or kind.coordinate.curved
-            rows += [free_row(sides, law, curved) for sides in kind.free_sides(frames)]
+            rows += [free_row(sides, law) for sides in kind.free_sides(frames)]
         else:
             rows.append(_coordinate_row(feature, group, frames, limits()))
     return rows
@@ -120,18 +117,18 @@ def _coordinate_row(feature: str, group: JointGroup, frames: JointFrames, limits
     """Row of a feature that acts along the coordinate."""
     coordinate = group.kind.coordinate
     assert coordinate is not None
-    sides, value, curved = coordinate.sides(frames), coordinate.value(frames), coordinate.curved
+    sides, value = coordinate.sides(frames), coordinate.value(frames)
     if coordinate.angular and feature in ("lower", "upper", "locked"):
         value = _turned_into(value, limits)
     if feature == "lower":
-        return lower_row(sides, value, limits[:, 0], curved)
+        return lower_row(sides, value, limits[:, 0])
     if feature == "upper":
-        return upper_row(sides, value, limits[:, 1], curved)
+        return upper_row(sides, value, limits[:, 1])
     if feature == "locked":
-        return JointRow(*sides, value - 0.5 * (limits[:, 0] + limits[:, 1]), HOLD, curved)
+        return JointRow(*sides, value - 0.5 * (limits[:, 0] + limits[:, 1]), HOLD)
     if feature == "velocity":
-        return free_row(sides, DRIVE, curved)
-    return JointRow(*sides, value, {"spring": ELASTIC, "position": SERVO}[feature], curved)
+        return free_row(sides, DRIVE)
+    return JointRow(*sides, value, {"spring": ELASTIC, "position": SERVO}[feature])
 
 
 def _turned_into(angle: Array, limits: Array) -> Array:
@@ -166,7 +163,10 @@ def moved_by(bodies: Bodies, time: Array) -> Bodies:
 
 
 def turning(model: Model, bodies: Bodies, start: JointRows, middle: JointRows) -> Array:
-    """What the turning of the Jacobians adds to the rates (slot, world) in half a step of `bodies`.
+    """What the turning of the Jacobians and of the inertia adds to the rates (slot, world) in half a step of `bodies`.
+
+    The rate at the end of a step is that of its middle with this added. Without it a rotor on a turning carrier would take
+    half of the change of its rate for none at all, whatever the step.
 
     Nothing where a body turns by more than a radian or so: the chord of so large a turn says nothing of where the step ends,
     and what it makes up in one step is energy for the next.

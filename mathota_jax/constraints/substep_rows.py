@@ -45,15 +45,13 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
     """Errors of the rows of `joint_rows`."""
     table, worlds = rows.table, rows.bias.shape[-1]
     slots = np.maximum(table.order, 0)
-    laws, curved = motion.start.laws[slots], motion.start.curved[slots]
+    laws = motion.start.laws[slots]
     shape = (table.turn_count, 1, table.column_count, 1)
 
     def packed(values: Array) -> Array:
         return pack_scalars(table, [decoupling.rows(values)], worlds)
 
-    curvature = None
-    if motion.turning is not None and curved.any():
-        curvature = packed(jnp.where(curved[:, None], take(motion.turning, slots), 0.0))
+    curvature = None if motion.turning is None else packed(take(motion.turning, slots))
     linear = jax.tree.leaves((motion.start.parent.linear, motion.start.child.linear))
     moves = functools.reduce(jnp.logical_or, [take(part, slots) != 0 for part in linear])
     branches = _branches(scene)[slots]

@@ -73,7 +73,7 @@ KIND = JointKind(
     point_rows,
     3,
     3,
-    Coordinate(twist, twist_sides, angular=True, curved=True),
+    Coordinate(twist, twist_sides, angular=True),
     rotation_axes,
     3,
     swing_row,

@@ -60,4 +60,4 @@ def length_sides(frames: JointFrames) -> Sides:
     return translation_sides(frames, where(length(frames) > 0, normalize(frames.offset), frames.parent.column_x))
 
 
-KIND = scalar_kind(Distance, fixed_rows, 0, 0, Coordinate(length, length_sides, angular=False, curved=True))
+KIND = scalar_kind(Distance, fixed_rows, 0, 0, Coordinate(length, length_sides, angular=False))

@@ -52,4 +52,4 @@ def angle_sides(frames: JointFrames) -> Sides:
     return rotation_sides(frames.parent.column_x)
 
 
-KIND = scalar_kind(Hinge, fixed_rows, 5, 3, Coordinate(twist, angle_sides, angular=True, curved=False))
+KIND = scalar_kind(Hinge, fixed_rows, 5, 3, Coordinate(twist, angle_sides, angular=True))

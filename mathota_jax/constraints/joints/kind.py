@@ -18,13 +18,11 @@ class Coordinate(NamedTuple):
       value: of each joint, 0 as built (but for a length).
       sides: its Jacobian.
       angular: whether it is an angle, in (-pi, pi].
-      curved: whether the direction of its Jacobian turns while the coordinate moves along it.
     """
 
     value: Callable[[JointFrames], Array]
     sides: Callable[[JointFrames], Sides]
     angular: bool
-    curved: bool
 
 
 class JointKind(NamedTuple):

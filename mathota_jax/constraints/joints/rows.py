@@ -25,14 +25,12 @@ class JointRow(NamedTuple):
       error: what the law acts on [m] or [rad]: the position error of a row that holds, the room left before a stop, the
         coordinate of a spring or servo.
       law: one of the laws above.
-      curved: whether the direction of the row turns while the coordinate moves along it.
     """
 
     parent: Side
     child: Side
     error: Array
     law: str = HOLD
-    curved: bool = True
 
 
 def translation_sides(frames: JointFrames, direction: Vec3) -> Sides:
@@ -75,19 +73,19 @@ def orientation_rows(frames: JointFrames) -> list[JointRow]:
     return [JointRow(*rotation_sides(column), error) for column, error in zip(frames.parent, components, strict=True)]
 
 
-def lower_row(sides: Sides, coordinate: Array, limit: Array, curved: bool) -> JointRow:
+def lower_row(sides: Sides, coordinate: Array, limit: Array) -> JointRow:
     """Stop at a lower limit."""
-    return JointRow(*sides, coordinate - limit, STOP, curved)
+    return JointRow(*sides, coordinate - limit, STOP)
 
 
-def upper_row(sides: Sides, coordinate: Array, limit: Array, curved: bool) -> JointRow:
+def upper_row(sides: Sides, coordinate: Array, limit: Array) -> JointRow:
     """Stop at an upper limit."""
-    return JointRow(*_against(sides), limit - coordinate, STOP, curved)
+    return JointRow(*_against(sides), limit - coordinate, STOP)
 
 
-def free_row(sides: Sides, law: str, curved: bool) -> JointRow:
+def free_row(sides: Sides, law: str) -> JointRow:
     """Row of a law that acts on the velocity alone."""
-    return JointRow(*sides, jnp.zeros((1, 1), sides[0].linear.x.dtype), law, curved)
+    return JointRow(*sides, jnp.zeros((1, 1), sides[0].linear.x.dtype), law)
 
 
 def _against(sides: Sides) -> Sides:

@@ -60,4 +60,4 @@ def displacement(frames: JointFrames) -> Array:
     return dot(frames.offset, frames.parent.column_x)
 
 
-KIND = scalar_kind(Slider, fixed_rows, 5, 2, Coordinate(displacement, displacement_sides, angular=False, curved=False))
+KIND = scalar_kind(Slider, fixed_rows, 5, 2, Coordinate(displacement, displacement_sides, angular=False))
