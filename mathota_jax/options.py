@@ -58,33 +58,34 @@ class Options:
         scenes of up to ten moving bodies, and in what mechanisms solve with their joints held; elsewhere for 1.5 times the
         solver's own sweeps where all rows are contacts with friction, for which they are accelerated, and for twice as many
         where not.
-      solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints solved
-        together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it can not
-        solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving body; warm
-        started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32 and 6e-6 m of
-        movement, but 26 CPU-s to compile. Of the numbers of iterations above only `position_iterations=0`, which leaves
-        positions alone, means anything to it. "soft_step": one collision pass and several substeps of two sweeps each,
-        which also take out position errors and are differentiated as they are: for stacks and piles of like masses at the
-        price of "pgs". Cubes of 1 m at 60 Hz: a cold stack of 10 dips 6 mm, with "pgs" 39 mm; one of 20 stands, which with
-        "pgs" it does not (60 Hz; 2.1 against 1.9 CPU-ms a step). It is none for large mass ratios (100 : 1 slides off) or
-        chains (ten links open by 1 %, "pgs" 1e-6), and a load sinks into what it rests on by
-        ``load / (2 effective mass * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`,
-        `baumgarte` and `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its
-        restitution pass. All figures: docs/solvers.md.
+      solver: "pgs": a fixed number of sweeps, the cheapest and what most scenes need. "converged": all constraints
+        solved together by Newton's method, for tall stacks, large mass ratios and exact derivatives; a world that it
+        can not solve is flagged (`Flag.SOLVER_NOT_CONVERGED`). Each iteration factorizes a matrix of 6 rows a moving
+        body; warm started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32
+        and 6e-6 m of movement, but 26 CPU-s to compile. Of the numbers of iterations above only
+        `position_iterations=0`, which leaves positions alone, means anything to it. "soft_step": one collision pass and
+        several substeps of two sweeps each, which also take out position errors and are differentiated as they are: for
+        stacks and piles of like masses at the price of "pgs". Cubes of 1 m at 60 Hz: a cold stack of 10 dips 6 mm, with
+        "pgs" 39 mm; one of 20 stands, which with "pgs" it does not (60 Hz; 2.1 against 1.9 CPU-ms a step). It is none
+        for large mass ratios (100 : 1 slides off), and a load sinks into what it rests on by ``load / (2 effective mass
+        * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`, `baumgarte` and
+        `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its restitution
+        pass. All figures: docs/solvers.md.
       conjugate: take the sweeps of "pgs" along conjugate directions where bodies lie on one another: for tall stacks and
         large mass ratios. At 60 Hz with ten sweeps in float32 a cube of 100 times the mass rests on a cube to 4e-6 of its
         size, of 1000 times the mass it dips by 4 % (sweeps alone let both fall through), and forty cubes stand, dipping by
         0.1 %. Ten such sweeps take a step 1.3 times as long. Worlds in which a contact slides are solved by sweeps alone;
         absent in scenes that bounce, and where joints are solved beside the contacts.
-      exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the end of
-        the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot stands on feet
-        of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a broadphase or of many
-        pairs for what touches at a time, and there are no other joints. Elsewhere three and more joints, or fewer where a
-        scene has nothing else to solve ("soft_step": there alone); one or two beside several contacts that bounce, and
-        nets whose loops more than 96 rows close, are left to the solver. Off: absent. Limits, motors, springs and friction
-        on their joints are solved with all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an
-        arm whose end is a hundred times as heavy as its first link, a stop or a spring acts as it would on one rigid body.
-        Springs and servos may be as stiff as they like.
+      exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the
+        end of the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot
+        stands on feet of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a
+        broadphase or of many pairs for what touches at a time, and there are no other joints. Elsewhere three and more
+        joints, or fewer where a scene has nothing else to solve; "soft_step" sweeps them in its small steps where it
+        has, and closes them at the end. One or two beside several contacts that bounce, and nets whose loops more than
+        96 rows close, are left to the solver. Off: absent. Limits, motors, springs and friction on their joints are
+        solved with all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is
+        a hundred times as heavy as its first link, a stop or a spring acts as it would on one rigid body. Springs and
+        servos may be as stiff as they like.
         Without it an error travels one joint a sweep: ten links at 1/240 s part by 5e-3 of a link and twenty at 1/60 s gain
         energy without bound; with it no gap is left but round-off. A step of ten links with "pgs" takes 1.2 times as long.
       substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.

@@ -16,6 +16,8 @@ from mathota_jax.constraints.assembly import collect
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.contact_force import slot_force
 from mathota_jax.constraints.decoupling import Decoupling
+from mathota_jax.constraints.mechanism_layout import layout
+from mathota_jax.constraints.mechanism_links import Impulses, to_slots
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -83,6 +85,17 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
         if problem.close is not None:
             changes["contact_pair"] = compact_matching.pair_keys(scene, problem.close)
     return {**changes, "flags": functools.reduce(jnp.bitwise_or, flags)} if flags else changes
+
+
+def with_closing(model: Model, joint_force: Array, closed: Impulses) -> Array:
+    """Joint forces (slot, world) with what closes mechanisms at the end of a step of small ones, see `close_joints`.
+
+    Sweeps in small steps leave to it a share of what the joints bear.
+    """
+    found = layout(model.scene)
+    assert found is not None
+    last = tuple(of_rounds[-1] for of_rounds in closed)
+    return joint_force + to_slots(found, last, joint_force.shape[0]) / model.dt
 
 
 def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tuple[Array, ...]) -> EndForces:

@@ -14,14 +14,14 @@ from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
 from mathota_jax.constraints.lever import levers
 from mathota_jax.constraints.mechanism import Solutions
-from mathota_jax.constraints.mechanism_layout import takes_small_steps
+from mathota_jax.constraints.mechanism_layout import layout, takes_small_steps
 from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
 from mathota_jax.leaf_shapes import check_actions, check_leaves, values_in_range
 from mathota_jax.model import Model
-from mathota_jax.outcome import end_forces, forces, new_state
+from mathota_jax.outcome import end_forces, forces, new_state, with_closing
 from mathota_jax.phases import (
     acting_inertia,
     close_joints,
@@ -203,11 +203,17 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
         moved = stop_at_impacts(model, bodies, inertia, moved, displacement)
-    if problem.held is not None:
+    if layout(scene) is not None:
         moved, closed = close_joints(model, bodies, moved, closed)
-    new = new_state(scene, state, moved, forces(model, problem, impulses), failed)
-    if last is not None and state.end_forces is not None:
-        new = dataclasses.replace(new, end_forces=end_forces(model, problem, state.end_forces, last))
+    found = forces(model, problem, impulses)
+    ends = None if last is None or state.end_forces is None else end_forces(model, problem, state.end_forces, last)
+    if small and closed is not None:
+        found["joint_force"] = with_closing(model, found["joint_force"], closed)
+        if ends is not None:
+            ends = dataclasses.replace(ends, joint_force=with_closing(model, ends.joint_force, closed))
+    new = new_state(scene, state, moved, found, failed)
+    if ends is not None:
+        new = dataclasses.replace(new, end_forces=ends)
     new = let_sleep(model, state, new, action, problem) if scene.options.sleep else new
     return new, Solved(None, None if closed is None else Solutions(held, closed), uncut)
 

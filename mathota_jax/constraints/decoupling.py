@@ -23,7 +23,7 @@ from jax import Array
 from mathota_jax.constraints.assembly import Side
 from mathota_jax.constraints.effective_mass import step_length
 from mathota_jax.constraints.joint_layout import joint_groups
-from mathota_jax.constraints.mechanism_layout import held_slots, layout
+from mathota_jax.constraints.mechanism_layout import held_slots, layout, takes_small_steps
 from mathota_jax.scene import Scene
 from mathota_jax.solver.table import EMPTY, Table
 from mathota_jax.spatial.indexing import in_every_world, take, unstack
@@ -35,7 +35,7 @@ from mathota_jax.struct import pytree, static
 
 def applies(scene: Scene) -> bool:
     """Whether rows are decoupled: mechanisms are solved exactly, and the converged solver does not sweep row by row."""
-    return scene.options.solver != "converged" and layout(scene) is None
+    return scene.options.solver != "converged" and (layout(scene) is None or takes_small_steps(scene))
 
 
 @pytree

@@ -244,7 +244,7 @@ def hold(
     bias = collect(tables, [group.bias[:, 0] for group in joint_rows], slot_count)
     wanted = jax.tree.map(lambda rate, bias: -(rate + bias), rates(links, velocity), of_slots(links, bias))
     change = solve(links, wanted, known)
-    of_all = to_slots(links, change, slot_count)
+    of_all = to_slots(links.layout, change, slot_count)
     new = [
         impulse + pack_scalars(table, [select(table, of_all)], of_all.shape[-1])
         for table, impulse in zip(tables, impulses[: len(tables)], strict=True)

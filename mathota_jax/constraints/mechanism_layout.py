@@ -135,7 +135,7 @@ def layout(scene: Scene) -> Layout | None:
     found = _of_trees(scene, 1)
     if found is not None and (_contact_places(scene, found) is not None or _has_no_others(scene, found)):
         return found
-    return None if options.solver == "soft_step" else _of_trees(scene, LEAST_JOINTS)
+    return _of_trees(scene, LEAST_JOINTS)
 
 
 def _of_trees(scene: Scene, least: int) -> Layout | None:

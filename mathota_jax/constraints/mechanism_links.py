@@ -243,12 +243,12 @@ def of_slots(links: Links, values: Array) -> Impulses:
     return only_held(links, [*(take(values, slots) for slots in links.layout.row_slots), *closing])
 
 
-def to_slots(links: Links, values: Impulses, slot_count: int) -> Array:
+def to_slots(found: Layout, values: Impulses, slot_count: int) -> Array:
     """Values in slot order, 0 for rows that mechanisms do not hold."""
-    held = links.layout.held
-    closing = list(links.layout.closing_slots)
+    held = found.held
+    closing = list(found.closing_slots)
     place = np.full(slot_count, held.size + len(closing))
-    place[links.layout.row_slots[held]] = np.flatnonzero(held)
+    place[found.row_slots[held]] = np.flatnonzero(held)
     place[closing] = held.size + np.arange(len(closing))
     return take(jnp.concatenate([*values, jnp.zeros_like(values[0][:1])]), place)
 

@@ -119,7 +119,7 @@ def constrain(
         if halfway is not None:
             there = merge(scene, bodies, halfway)
         middle = joint_rows.joint_rows(model, there)
-        if mechanism_layout.layout(scene) is not None:
+        if mechanism_layout.layout(scene) is not None and not small_steps:
             held = mechanism_links.links(scene, middle, moving(scene, there).position, inertia)
         coefficients = row_coefficients.row_coefficients(model, action, joints)
         turning = joint_rows.turning(model, bodies, joints, middle)

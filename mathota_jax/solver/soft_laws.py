@@ -34,8 +34,10 @@ HARDNESS = PHASE * (2.0 * DAMPING_RATIO + PHASE)
 OVER_RELAXATION = 1.4
 """Of joints, and of stops that carried something before; an impact gets its exact step. Measured on 10 to 40 loads: at
 1 it sloshes for seconds, from 1.3 to 1.5 it comes to rest within one, at 1.7 it diverges. Joints of a body with more
-than two get their exact step: two boxes welded to the sides of a third, which is welded to a wall, flew off at 1.2.
-(Three still sway more and more, from 0.2 rad/s after a second to 8 after four: not understood.)"""
+than two get their exact step. Sweeps over a few rows that all feel one another leave modes of complex or negative share,
+which impulses that carry over amplify: two boxes welded to the sides of a third, which is welded to a wall, flew off at
+1.2, and three swayed ever more at 1, had joints not been closed at the end of the step (`phases.close_joints`). Closed,
+all of 120 random trees with masses up to 1 : 100 come to rest; the slowest mode keeps 0.60 a step, with 1.4 here 0.92."""
 
 CONTACT_OVER_RELAXATION = 1.5
 """Likewise of contacts. With 1.4 a wall of 210 cubes sways out of its plane four times as far; with 1.5 chains open more."""
