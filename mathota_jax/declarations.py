@@ -46,9 +46,7 @@ def mass_properties(
     if (mass is None) == (density is None):
         raise ValueError(f"{label}: give exactly one of mass and density (or static=True)")
     key, value = ("mass", mass) if density is None else ("density", density)
-    given = number(f"{label}: {key}", value, 0.0, math.inf)
-    if given == 0:
-        raise ValueError(f"{label}: {key} must be positive, got 0")
+    given = positive(f"{label}: {key}", value)
     properties = shape.mass_properties()
     total = given if density is None else given * float(properties.volume)
     moments, frame = principal_axes(np.asarray(properties.unit_inertia))
@@ -65,6 +63,14 @@ def number(label: str, value: Any, lower: float, upper: float) -> float:
         bounds = f"between {lower:g} and {upper:g}" if math.isfinite(upper) else f"of at least {lower:g}"
         bounds = "" if math.isinf(lower) else f" {bounds}"
         raise ValueError(f"{label} must be a finite number{bounds}, got {value!r}")
+    return found
+
+
+def positive(label: str, value: Any) -> float:
+    """A finite number above 0."""
+    found = number(label, value, -math.inf, math.inf)
+    if found <= 0:
+        raise ValueError(f"{label} must be positive, got {found:g}")
     return found
 
 

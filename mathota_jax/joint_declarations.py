@@ -10,7 +10,7 @@ import numpy as np
 
 from mathota_jax.constraints.joints import JOINTS
 from mathota_jax.constraints.joints.kind import JointKind
-from mathota_jax.declarations import Body, number
+from mathota_jax.declarations import Body, number, positive
 from mathota_jax.geometry.validation import finite_vector
 from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate_back
 
@@ -131,9 +131,9 @@ def declare_motor(label: str, joint: Joint, index: int, kind: str, given: dict[s
     motor = Motor(
         joint=index,
         kind=kind,
-        limit=_positive(f"{label}: limit", given["limit"]),
+        limit=positive(f"{label}: limit", given["limit"]),
         gear=number(f"{label}: gear", given["gear"], -math.inf, math.inf),
-        cap=OUT_OF_REACH if given["cap"] is None else _positive(f"{label}: cap", given["cap"]),
+        cap=OUT_OF_REACH if given["cap"] is None else positive(f"{label}: cap", given["cap"]),
         stiffness=number(f"{label}: stiffness", given["stiffness"], 0.0, math.inf),
         damping=number(f"{label}: damping", given["damping"], 0.0, math.inf),
     )
@@ -206,10 +206,3 @@ def _check_freedom(label: str, joint: Joint, kind: JointKind) -> None:
     for option in ("damping", "friction", "stiffness", "armature"):
         if kind.free_count == 1 and getattr(joint, option) > 0:
             raise ValueError(f"{label}: {option} has no effect where equal limits hold the coordinate; leave it out")
-
-
-def _positive(label: str, value: Any) -> float:
-    found = number(label, value, 0.0, math.inf)
-    if found == 0:
-        raise ValueError(f"{label} must be positive, got 0")
-    return found
