@@ -69,7 +69,7 @@ def test_impulses_are_those_of_the_dense_matrix(float64, case, gate):
     wanted = generator.normal(size=(rows, 2))
     impulses = mechanism.solve(links, mechanism_links.of_slots(links, jnp.asarray(wanted)))
     change = np.asarray(mechanism_links.push(links, impulses))
-    solved = np.asarray(mechanism_links.to_slots(links, impulses, rows))
+    solved = np.asarray(mechanism_links.to_slots(links.layout, impulses, rows))
     ends = {}
     for link in found.links:
         for slot in (*link.slots[0], *link.slots[1]):
