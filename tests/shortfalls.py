@@ -24,6 +24,9 @@ SHORTFALLS: dict[str, str] = {
             ("no joint, 30 and 100 s", "float64", "beside one that falls", 516),
         )
     },
+    "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
+    "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "
+    "stay so, gate 5 mm; 1 mm with the default solver",
     "tests/unit/test_convex.py::test_many_random_poses[float64-cone_cone]": "one of 952 poses, half overlapped, ends in a "
     "local minimum of the depth 4.3e-3 of the size too deep (flagged, as 2 % of the deep ones are); in float32 none",
 }

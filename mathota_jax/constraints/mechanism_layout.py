@@ -17,8 +17,7 @@ _Slots = tuple[tuple[int, ...], tuple[int, ...]]
 
 LEAST_JOINTS = 3
 """Joints of the smallest mechanism beside rows that are swept in turn with it: two converge in a few sweeps, which are
-cheaper. Elsewhere one is enough, and so it is with small steps, whose few sweeps leave even one open by its length where
-it hits a wall."""
+cheaper. Elsewhere one is enough."""
 
 MOST_CLOSING = 96
 """Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
@@ -136,7 +135,7 @@ def layout(scene: Scene) -> Layout | None:
     found = _of_trees(scene, 1)
     if found is not None and (_contact_places(scene, found) is not None or _has_no_others(scene, found)):
         return found
-    return _of_trees(scene, 1 if options.solver == "soft_step" else LEAST_JOINTS)
+    return _of_trees(scene, LEAST_JOINTS)
 
 
 def _of_trees(scene: Scene, least: int) -> Layout | None:
