@@ -87,15 +87,15 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
     return {**changes, "flags": functools.reduce(jnp.bitwise_or, flags)} if flags else changes
 
 
-def with_closing(model: Model, joint_force: Array, closed: Impulses) -> Array:
-    """Joint forces (slot, world) with what closes mechanisms at the end of a step of small ones, see `close_joints`.
+def closing_force(model: Model, closed: Impulses) -> Array:
+    """Mean joint forces (slot, world) of what closes mechanisms at the end of a step, see `close_joints`.
 
     Sweeps in small steps leave to it a share of what the joints bear.
     """
     found = layout(model.scene)
     assert found is not None
     last = tuple(of_rounds[-1] for of_rounds in closed)
-    return joint_force + to_slots(found, last, joint_force.shape[0]) / model.dt
+    return to_slots(found, last, joint_layout.joint_row_count(model.scene)) / model.dt
 
 
 def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tuple[Array, ...]) -> EndForces:

@@ -21,7 +21,7 @@ from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
 from mathota_jax.leaf_shapes import check_actions, check_leaves, values_in_range
 from mathota_jax.model import Model
-from mathota_jax.outcome import end_forces, forces, new_state, with_closing
+from mathota_jax.outcome import closing_force, end_forces, forces, new_state
 from mathota_jax.phases import (
     acting_inertia,
     close_joints,
@@ -208,9 +208,10 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     found = forces(model, problem, impulses)
     ends = None if last is None or state.end_forces is None else end_forces(model, problem, state.end_forces, last)
     if small and closed is not None:
-        found["joint_force"] = with_closing(model, found["joint_force"], closed)
+        closing = closing_force(model, closed)
+        found["joint_force"] = found["joint_force"] + closing
         if ends is not None:
-            ends = dataclasses.replace(ends, joint_force=with_closing(model, ends.joint_force, closed))
+            ends = dataclasses.replace(ends, joint_force=ends.joint_force + closing)
     new = new_state(scene, state, moved, found, failed)
     if ends is not None:
         new = dataclasses.replace(new, end_forces=ends)

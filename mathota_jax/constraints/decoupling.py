@@ -34,7 +34,7 @@ from mathota_jax.struct import pytree, static
 
 
 def applies(scene: Scene) -> bool:
-    """Whether rows are decoupled: mechanisms are solved exactly, and the converged solver does not sweep row by row."""
+    """Whether rows are decoupled: not where the step solves mechanisms exactly, or where no row is swept by itself."""
     return scene.options.solver != "converged" and (layout(scene) is None or takes_small_steps(scene))
 
 

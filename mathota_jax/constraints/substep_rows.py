@@ -51,7 +51,7 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
     def packed(values: Array) -> Array:
         return pack_scalars(table, [decoupling.rows(values)], worlds)
 
-    curvature = None if motion.turning is None else packed(take(motion.turning, slots))
+    assert motion.turning is not None
     linear = jax.tree.leaves((motion.start.parent.linear, motion.start.child.linear))
     moves = functools.reduce(jnp.logical_or, [take(part, slots) != 0 for part in linear])
     branches = _branches(scene)[slots]
@@ -61,7 +61,7 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
         start=packed(take(motion.start.error, slots)),
         limit=limit,
         one_sided=jnp.asarray(laws == STOP).reshape(shape) if (laws == STOP).any() else None,
-        curvature=curvature,
+        curvature=packed(take(motion.turning, slots)),
         force=_force_laws(scene, rows, model, motion, laws.reshape(shape)),
         branches=jnp.asarray(branches).reshape(shape) if branches.any() else None,
     )

@@ -76,7 +76,7 @@ class PositionError:
       limit: largest velocity of a correction.
       one_sided: whether the row only pushes, (turn, 1, column, 1), or of size 1; None where all rows also pull.
       lever: time [s] that the impulse of a bounce has to act on the position; None for joints.
-      curvature: what the turning of the Jacobian adds to ``J v`` in half a step; None where it does not turn.
+      curvature: what the turning of the Jacobian adds to ``J v`` in half a step; None for contacts.
       force: rows that obey a law of force instead; None without any.
       branches: whether the row is one of a joint of a body with more than two, (turn, 1, column, 1); None where none is.
     """
