@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mathota_jax.cautions import cautions
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.plan import plan_broadphase
 from mathota_jax.constraints.joint_layout import joint_row_count
-from mathota_jax.constraints.mechanism_layout import links_with_swept_contacts
+from mathota_jax.constraints.mechanism_layout import takes_small_steps
 from mathota_jax.constraints.warm_start import matches_by_distance
 from mathota_jax.declarations import UNTURNED, Body, boolean, look_up, look_up_all, mass_properties, number
 from mathota_jax.geometry import SHAPES, Compound, Shape
@@ -220,16 +221,10 @@ class SceneBuilder:
             raise ValueError("build: the scene has no body; call add_body first")
         table = shape_table(self._bodies)
         scene = self._scene(table, options)
-        if (links := links_with_swept_contacts(scene)) is not None:
-            warnings.warn(
-                f"build: the contacts of '{links[0]}' to '{links[-1]}', {len(links)} bodies with joints, are swept in turn "
-                "with their joints: too many may touch at a time to be solved with the joints held, or there are joints "
-                "that are left to the sweeps. What stands on light feet will sink. Leave pairs out "
-                "(SceneBuilder.ignore_collisions), allow fewer to touch at a time (Options.touching_capacity), or pass "
-                'solver="converged"; exact_joints=False if this is what you want',
-                stacklevel=2,
-            )
-        return self._model(scene, table, options.dt), self._state(scene)
+        model = self._model(scene, table, options.dt)
+        for caution in cautions(model):
+            warnings.warn(caution, stacklevel=2)
+        return model, self._state(scene)
 
     def _scene(self, table: ShapeTable, options: Options) -> Scene:
         bodies = self._bodies
@@ -338,9 +333,7 @@ class SceneBuilder:
             )
             if scene.options.sleep
             else None,
-            end_forces=EndForces(jnp.copy(contact_force), jnp.copy(joint_force))
-            if scene.options.solver == "soft_step"
-            else None,
+            end_forces=EndForces(jnp.copy(contact_force), jnp.copy(joint_force)) if takes_small_steps(scene) else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int], ignored: Filter) -> tuple[PairGroup, ...]:

@@ -11,7 +11,13 @@ from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.constraints.contact import contact_tables
 from mathota_jax.constraints.contact_room import rows_of_a_point
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
-from mathota_jax.constraints.mechanism_layout import bounded_slots, contact_places, layout, takes_contacts
+from mathota_jax.constraints.mechanism_layout import (
+    bounded_slots,
+    contact_places,
+    layout,
+    takes_contacts,
+    takes_small_steps,
+)
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -127,7 +133,7 @@ def _state_bytes(model: Model) -> int:
     scene = model.scene
     number = model.dt.dtype.itemsize
     forces = 3 * scene.slot_count + joint_row_count(scene)
-    floats = scene.body_count * FLOATS_OF_A_BODY + forces * (2 if scene.options.solver == "soft_step" else 1)
+    floats = scene.body_count * FLOATS_OF_A_BODY + forces * (2 if takes_small_steps(scene) else 1)
     integers = scene.slot_count + 1 + scene.place_count
     sleep = scene.body_count * (8 * number + 1) if scene.options.sleep else 0
     return floats * number + integers * 4 + sleep

@@ -64,11 +64,12 @@ class Options:
         body; warm started rest takes 0 to 5 of them, a falling pile 20. Ten stacked boxes: 0.7 CPU-ms a step in float32
         and 6e-6 m of movement, but 26 CPU-s to compile. Of the numbers of iterations above only
         `position_iterations=0`, which leaves positions alone, means anything to it. "soft_step": one collision pass and
-        several substeps of two sweeps each, which also take out position errors and are differentiated as they are: for
-        stacks and piles of like masses at the price of "pgs". Cubes of 1 m at 60 Hz: a cold stack of 10 dips 6 mm, with
-        "pgs" 39 mm; one of 20 stands, which with "pgs" it does not (60 Hz; 2.1 against 1.9 CPU-ms a step). It is none
-        for large mass ratios (100 : 1 slides off), and a load sinks into what it rests on by ``load / (2 effective mass
-        * (pi / 2 * substep rate)^2)``. `position_iterations`, `slop`, `position_percent`, `baumgarte` and
+        several substeps of four sweeps each, which also take out position errors and are differentiated as they are: for
+        stacks, piles and what falls on small bodies. Cubes of 1 m at 60 Hz: a stack of 10 dips by 3 mm, with "pgs" by 15;
+        one of 20 by 14 mm, with "pgs" by 0.3 m. A load sinks into what it rests on by ``load / (2 effective mass * (pi / 2
+        * substep rate)^2)``: a cube of 100 times the mass into another by 3.5 % of its size, with 16 substeps by 0.2 %. What
+        has no contacts and is one with its joints is solved as with "pgs"; beside contacts, stiff springs and servos of
+        mechanisms are beyond it (`build` warns). `position_iterations`, `slop`, `position_percent`, `baumgarte` and
         `gradient_iterations` do not concern it, and `velocity_iterations` is the number of sweeps of its restitution
         pass. All figures: docs/solvers.md.
       conjugate: take the sweeps of "pgs" along conjugate directions where bodies lie on one another: for tall stacks and
@@ -80,12 +81,13 @@ class Options:
         end of the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot
         stands on feet of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a
         broadphase or of many pairs for what touches at a time, and there are no other joints. Elsewhere three and more
-        joints, or fewer where a scene has nothing else to solve; "soft_step" sweeps them in its small steps where it
-        has, and closes them at the end. One or two beside several contacts that bounce, and nets whose loops more than
-        96 rows close, are left to the solver. Off: absent. Limits, motors, springs and friction on their joints are
-        solved with all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is
-        a hundred times as heavy as its first link, a stop or a spring acts as it would on one rigid body. Springs and
-        servos may be as stiff as they like.
+        joints, or fewer where a scene has nothing else to solve but what drives them, of which some are springs or
+        servos. "soft_step" sweeps joints in its small steps beside contacts, and closes them at the end. With the other
+        solvers one or two beside several contacts that bounce, and with all of them nets whose loops more than 96 rows
+        close, are left to the solver. Off: absent. Limits, motors, springs and friction on their joints are solved with
+        all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred
+        times as heavy as its first link, a stop or a spring acts as it would on one rigid body. Springs and servos may
+        be as stiff as they like.
         Without it an error travels one joint a sweep: ten links at 1/240 s part by 5e-3 of a link and twenty at 1/60 s gain
         energy without bound; with it no gap is left but round-off. A step of ten links with "pgs" takes 1.2 times as long.
       substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.

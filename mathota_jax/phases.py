@@ -205,7 +205,7 @@ def _solve_mechanisms(
     def hold(velocity: Array, impulses: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         return mechanism.hold(held, problem.joint_rows, velocity, impulses)[:2]
 
-    responses = problem.responses if scene.options.solver == "pgs" else None
+    responses = None if scene.options.solver == "converged" else problem.responses
     bounded = () if responses is None else bounded_slots(scene)
     failed, joint_count = None, len(problem.joint_rows)
     if responses is not None and covers_with_bounds(scene):

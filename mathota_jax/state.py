@@ -64,7 +64,7 @@ class Sleep:
 
 @pytree
 class EndForces:
-    """Forces at the end of the last step, from which the small steps start; in scenes with ``solver="soft_step"`` alone.
+    """Forces at the end of the last step, from which the small steps start; in scenes that take them alone.
 
     The mean forces of a step are late by half of it. Sweeps that start from them lag behind a load that changes, which
     acts like a damper of the wrong sign: a stack of twenty swayed ever more.
@@ -102,7 +102,7 @@ class State:
         in inner radii of that body along the axes of the world; None unless contacts are matched by distance
         (`Options.warm_start_match`).
       sleep: timers of the sleeping system; None unless `Options.sleep`.
-      end_forces: from which the small steps start; None unless ``Options.solver`` is "soft_step".
+      end_forces: from which the small steps start; None unless a scene takes them (``Options.solver``).
     """
 
     position: Array

@@ -74,7 +74,7 @@ def step(model: Model, state: State, action: Array | None = None) -> State:
             f"step: the model was built with Options(sleep={scene.options.sleep}), the state was not; take both from one "
             "call of build"
         )
-    if (state.end_forces is not None) != (scene.options.solver == "soft_step"):
+    if (state.end_forces is not None) != takes_small_steps(scene):
         raise ValueError(
             f"step: the model was built with Options(solver={scene.options.solver!r}), the state was not; take both from "
             "one call of build"

@@ -10,9 +10,6 @@ SHORTFALLS: dict[str, str] = {
     "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
     "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
     "rebounds would gain energy all of that step are cut, which is 0.2 % of it",
-    "tests/physics/test_hard_scenes.py::test_gates[B5a card house, dt 0.0042-soft_step]": "2 of 40 cards fall, gate 0: "
-    "from three levels on the house sways at 11 Hz, also in float64 and without over-relaxation, e-fold in 0.2 s from "
-    "the converged solver's rest; 18 with the default solver, none with the converged one",
     **{
         f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{scene}-{precision}]": f"two boxes "
         f"{what}, at rest to a micrometre, gain {gain} times the energy of a lift, gate 0.01; none in steps up to 1 s, "
@@ -24,9 +21,6 @@ SHORTFALLS: dict[str, str] = {
             ("no joint, 30 and 100 s", "float64", "beside one that falls", 516),
         )
     },
-    "tests/physics/test_fast_bodies.py::test_a_jointed_pair_that_hits_a_wall_closes_again[soft_step]": "two bodies of 0.1 m "
-    "on one ball joint, in steps in which they turn by one to three radians: 8 of 48 are open by 1 to 2 cm, one by 1 m, and "
-    "stay so, gate 5 mm; 1 mm with the default solver",
     "tests/unit/test_convex.py::test_many_random_poses[float64-cone_cone]": "one of 952 poses, half overlapped, ends in a "
     "local minimum of the depth 4.3e-3 of the size too deep (flagged, as 2 % of the deep ones are); in float32 none",
 }

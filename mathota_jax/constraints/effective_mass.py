@@ -35,7 +35,7 @@ bodies creeping by mm/s. One or two points have a bound that is exact, and would
 def step_length(scene: Scene, found: Any) -> Any:
     """What only decides how far a row steps, with the derivatives that it deserves.
 
-    None where sweeps go on until it moves nothing. A small step consists of two sweeps, whose rows are as soft as they are
+    None where sweeps go on until it moves nothing. A small step consists of four sweeps, whose rows are as soft as they are
     light: of it, the lengths of their steps are a part.
 
     Args:

@@ -17,7 +17,11 @@ _Slots = tuple[tuple[int, ...], tuple[int, ...]]
 
 LEAST_JOINTS = 3
 """Joints of the smallest mechanism beside rows that are swept in turn with it: two converge in a few sweeps, which are
-cheaper. Elsewhere one is enough."""
+cheaper (an arm of two links with limits takes half the time, its gradient too). Elsewhere one is enough, and so it is with
+small steps, whose few sweeps leave even one open by its length where it hits a wall."""
+
+STIFF = ("spring", "position")
+"""Features of joints that may hold almost as a joint does."""
 
 MOST_CLOSING = 96
 """Rows that close loops in the largest mechanism: they are solved as a dense system. What has more is left to the sweeps."""
@@ -133,7 +137,9 @@ def layout(scene: Scene) -> Layout | None:
     if options.impact_events or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
-    if found is not None and (_contact_places(scene, found) is not None or _has_no_others(scene, found)):
+    if found is None or options.solver == "soft_step" or _has_no_others(scene, found):
+        return found
+    if _contact_places(scene, found) is not None or _has_stiff_drives(scene, found):
         return found
     return _of_trees(scene, LEAST_JOINTS)
 
@@ -175,6 +181,21 @@ def _spanning(joints: list[int], ends: dict[int, tuple[int, ...]], held: dict[in
 def _has_no_others(scene: Scene, found: Layout) -> bool:
     """Whether the scene has no other rows than those of some mechanisms."""
     return not scene.slot_count and _row_count(found) == joint_row_count(scene)
+
+
+def _has_only_bounded(scene: Scene, found: Layout) -> bool:
+    """Whether all its others have bounds, or are soft, and act on these mechanisms."""
+    return not scene.slot_count and _row_count(found) + len(_bounded_slots(scene, found)) == joint_row_count(scene)
+
+
+def _has_stiff_drives(scene: Scene, found: Layout) -> bool:
+    """Whether all others have bounds, or are soft, and some are springs or servos that sweeps could not settle.
+
+    An arm of two links on servos, with stops, went round at 1e6 rad/s.
+    """
+    stiff = any(feature in STIFF for group in joint_groups(scene) for feature in group.features)
+    several = len(_bounded_slots(scene, found)) > 1
+    return scene.options.solver == "pgs" and stiff and several and _has_only_bounded(scene, found)
 
 
 def _contact_places(scene: Scene, found: Layout) -> Places | None:
@@ -221,15 +242,13 @@ def covers(scene: Scene) -> bool:
 
 def takes_small_steps(scene: Scene) -> bool:
     """Whether a step is one of small ones: not where mechanisms are solved at once, which no small step does better."""
-    return scene.options.solver == "soft_step" and not covers(scene)
+    return scene.options.solver == "soft_step" and not covers_with_bounds(scene)
 
 
 def covers_with_bounds(scene: Scene) -> bool:
     """Whether it has no others than those and rows with bounds on mechanisms."""
     found = layout(scene)
-    if found is None or scene.slot_count:
-        return False
-    return _row_count(found) + len(bounded_slots(scene)) == joint_row_count(scene)
+    return found is not None and _has_only_bounded(scene, found)
 
 
 @functools.cache

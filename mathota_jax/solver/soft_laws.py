@@ -1,4 +1,4 @@
-"""Rows of small steps: laws and biases of the soft sweep and of the sweep that relaxes it."""
+"""Rows of small steps: laws and biases of the soft sweeps and of those that relax them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.struct import pytree
 
 PHASE = 2.0 * math.pi / 4.0
-"""Frequency of the correction times the substep: a quarter of the substep rate, the stiffest that one sweep follows."""
+"""Frequency of the correction times the substep: a quarter of the substep rate. At a third of it a house of cards falls."""
 
 DAMPING_RATIO = 10.0
 """Of the correction. Far overdamped, since sweeps that have not converged act like an elastic chain (Catto's value)."""
@@ -123,7 +123,8 @@ class Manifold:
                 residual = residual + self.softness * new
             new = jnp.maximum(new - mass * residual, 0.0)
         if self.lasting is not None:
-            new = jnp.maximum(old + jnp.where(self.lasting, CONTACT_OVER_RELAXATION, 1.0) * (new - old), 0.0)
+            longer = jnp.where(self.lasting & (old > 0), CONTACT_OVER_RELAXATION, 1.0)
+            new = jnp.maximum(old + longer * (new - old), 0.0)
         return new[None]
 
     def hold(self, normal: Array, old: Sequence[Array], errors: Sequence[Array]) -> list[Array]:
@@ -178,7 +179,7 @@ def apart_rows(group: Group, present: Array) -> Array | None:
 
 
 def soft_law(group: Group, lasting: Array, apart: Array | None) -> Any:
-    """Law of the first sweep, in which half of the impulse of a substep acts; gaps close to the surface exactly."""
+    """Law of the soft sweeps, in which half of the impulse of a substep acts; gaps close to the surface exactly."""
     coupling, law, force = group.coupling, group.rows.law, group.error.force
     if coupling is not None:
         points = group.rows.table.together
@@ -261,7 +262,7 @@ def correction(
     length: Array,
     dt: Array,
 ) -> Array:
-    """Bias of the first sweep: closes gaps at most, and takes out a share of an overlap; `present` is the error now."""
+    """Bias of the soft sweeps: closes gaps at most, and takes out a share of an overlap; `present` is the error now."""
     error = group.error
     speed = jnp.clip(present * (SHARE / length), -error.limit, error.limit)
     if apart is not None:
@@ -276,7 +277,7 @@ def correction(
 
 
 def end_biases(groups: tuple[Group, ...], wanted: tuple[Array | None, ...], time: Array, dt: Array) -> tuple:
-    """Biases of the sweep that relaxes the rows at `time`, the end of a substep."""
+    """Biases of the sweeps that relax the rows at `time`, the end of a substep."""
     biases = []
     for group, law_bias in zip(groups, wanted, strict=True):
         bias = _drift(group, time, dt) + group.free_rate(time)

@@ -1,8 +1,8 @@
 """Small steps with soft corrections: the "Soft Step" scheme on rows of any kind.
 
-A step has one collision pass and n substeps. In each of them the velocity is kicked, every row is swept once with a soft
-bias that takes out a share of the position error, the bodies drift at that velocity, and a second sweep without the bias
-*relaxes* the rows, so that the push-out velocity does not stay (E. Catto, "Solver2D", box2d.org, 2024; Box2D v3).
+A step has one collision pass and n substeps. In each of them the velocity is kicked, every row is swept twice with a soft
+bias that takes out a share of the position error, the bodies drift at that velocity, and two sweeps without the bias
+*relax* the rows, so that the push-out velocity does not stay (E. Catto, "Solver2D", box2d.org, 2024; Box2D v3).
 
 What differs from there, and why:
 
@@ -12,6 +12,7 @@ What differs from there, and why:
   rolling sphere, where anchors fixed in the body would lift off, and right to second order in the turn of a step elsewhere.
 * The stiffness is not capped at 30 Hz: a load sinks by ``load / (2 effective mass * frequency^2)``, so that a cap would
   keep the error from falling with the substep.
+* Rows are swept twice where Catto sweeps once (`SWEEPS`).
 * The points of a manifold are solved together (a sequence would tilt a stack), and every sweep over-relaxes. Ten boxes
   bounce for ever with the bounded step of `Cone` and come to rest exactly with this one.
 """
@@ -40,6 +41,13 @@ from mathota_jax.solver.soft_laws import (
     rigid_law,
     soft_law,
 )
+
+SWEEPS = 2
+"""Sweeps before and after the drift of a substep. Impulses that lag behind a load act like dampers of the wrong sign. With
+one each a house of cards that rests sways ever more at any rate of substeps, e-fold in 0.2 s; with two before and one
+after in 0.5 s, and 20 cubes at one point part at 5.8 m/s, not 2.6; with two each its sway dies away (1/240 and 1/480 s,
+float64). Four substeps of two sweeps each let a wall of 210 cubes sway out of its plane a sixteenth as far as four of one,
+eight of one half as far."""
 
 
 class Impulses(NamedTuple):
@@ -112,7 +120,7 @@ def solve(
             correction(group, law_bias, error, gap, velocity, time, length, dt) + group.free_rate(middle)
             for group, law_bias, error, gap in zip(groups, wanted, present, apart, strict=True)
         )
-        velocity, impulses = _sweep(1, rows, laws, biases, velocity + half, halves)
+        velocity, impulses = _sweep(SWEEPS, rows, laws, biases, velocity + half, halves)
         displacement = displacement + length * velocity
         velocity = velocity * decay
         impulses = tuple(first + second for first, second in zip(impulses, halves, strict=True))
@@ -121,7 +129,7 @@ def solve(
             for group, impulse, before in zip(groups, impulses, lasting, strict=True)
         )
         biases = end_biases(groups, wanted, end, dt)
-        velocity, impulses = _sweep(1, rows, laws, biases, velocity + half, impulses)
+        velocity, impulses = _sweep(SWEEPS, rows, laws, biases, velocity + half, impulses)
         total = tuple(before + impulse for before, impulse in zip(total, impulses, strict=True))
         # What the impulses changed in this substep is what they would change in the next one.
         return (velocity, velocity - start, displacement, impulses, total, wanted), None

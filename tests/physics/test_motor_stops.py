@@ -1,12 +1,14 @@
-"""Motors that drive into the stops of their joints, against statics: none yields to the other, with or without a cap."""
+"""Motors and servos that drive into the stops of their joints, against statics: none yields to the other."""
+
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Hinge, SceneBuilder, Sphere, joint_forces, joint_position, joint_velocity, rollout
-from tests.marks import slow_but
+from mathota_jax import Box, Hinge, Plane, SceneBuilder, Sphere, joint_forces, joint_position, joint_velocity, rollout
+from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
 from tests.scenes import DOWN, GRAVITY, undamped
 
 LENGTH, HALF, MASS, STOP, DT = 0.4, 0.02, 1.0, 0.3, 1 / 240
@@ -51,3 +53,49 @@ def test_a_motor_holds_its_joint_at_the_stop_and_leaves_it_as_told(solver, cap, 
     left = STOP * ways - np.arange(1, 61)[:, None] * DT * ways
     gate("on the way back [rad]", place[720:] - left, 1.5 * DT)
     assert not record.flags.any()
+
+
+def servo_arm(solver, links, mass, stiffness, contacts=False):
+    """Links in a row along x, whose critically damped servos want 1 rad, beyond their stops."""
+    builder = SceneBuilder(gravity=DOWN)
+    last = builder.add_body(Sphere(0.02), static=True, collides=False)
+    if contacts:
+        builder.add_body(Plane((0, 1, 0)), static=True, position=(0, -5, 0))
+        builder.add_body(Sphere(0.1), mass=1.0, position=(0, -4.9, 0))
+    for link in range(links):
+        place = (LENGTH * (link + 0.5), 0, 0)
+        body = builder.add_body(Box((LENGTH / 2, HALF, HALF)), mass=mass, position=place, collides=False)
+        joint = builder.add_joint(Hinge(last, body, (LENGTH * link, 0, 0), (0, 0, 1), limits=(-1.0, STOP)))
+        damping = 2 * np.sqrt(stiffness * mass * LENGTH**2 / 3)
+        builder.add_motor(joint, kind="position", stiffness=stiffness, damping=damping)
+        last = body
+    return builder.build(undamped(dt=1 / 60, solver=solver))
+
+
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize("links", slow_but((2,), (1, 2, 3)))
+@pytest.mark.parametrize("solver", slow_but(("pgs",), ("pgs", "soft_step", "converged")))
+def test_stiff_servos_rest_against_stops(precision, solver, links, gate):
+    """Swept, two links of 0.1 kg with 1e4 N m/rad went round at 1e6 rad/s (default), and `soft_step` gave NaN."""
+    for mass, stiffness in ((1.0, 1e2), (1.0, 1e4), (0.1, 1e4)):
+        model, state = servo_arm(solver, links, mass, stiffness)
+        _, record = rollout(model, state, jnp.ones((240, links)))
+        last = jax.tree.map(lambda leaf: leaf[-30:], record)
+        place = jax.vmap(joint_position, (None, 0))(model, last)
+        rate = jax.vmap(joint_velocity, (None, 0))(model, last)
+        name = f"{mass:g} kg, {stiffness:g} N m/rad"
+        gate(f"{name}: at the stop [rad]", np.asarray(place, float) - STOP, 1e-4)
+        # Servo and stop push against each other; what rounds off of that turns a link.
+        pressed = stiffness * (1.0 - STOP) / 60 / (mass * LENGTH**2 / 3)
+        exact = {"float32": 5e-4, "float64": 1e-6}[str(precision)]
+        gate(f"{name}: rate [rad/s]", rate, exact + 20 * np.finfo(precision).eps * pressed)
+
+
+def test_build_warns_of_drives_too_stiff_for_small_steps():
+    with pytest.warns(UserWarning, match=r"spring or servo of 'joint0' \(2 such joints\) is too stiff for small steps"):
+        servo_arm("soft_step", 2, 1.0, 1e4, contacts=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        servo_arm("soft_step", 2, 1.0, 1e2, contacts=True)
+        servo_arm("soft_step", 1, 1.0, 1e4, contacts=True)
+        servo_arm("soft_step", 2, 1.0, 1e4)
