@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import collections
 
 import numpy as np
 
@@ -39,15 +39,17 @@ def _stiff_drives(model: Model) -> list[str]:
     scene = model.scene
     if not scene.joints or not takes_small_steps(scene):
         return []
-    stiffness = np.asarray(model.joint_stiffness, float).copy()
+    stiffness = np.array(model.joint_stiffness, float)
     for motor, entry in enumerate(scene.motors):
         if entry.kind == "position":
             stiffness[entry.joint] += float(model.motor_stiffness[motor])
     substep = float(model.dt) / scene.options.substep_count
+    joints_of = collections.Counter(body for joint in range(len(scene.joints)) for body in _moving_bodies(model, joint))
     stiff = [
-        name
-        for joint, name in enumerate(scene.joint_names)
-        if _shares_a_body(model, joint) and stiffness[joint] * substep**2 > STIFFEST * _smallest_inertia(model, joint)
+        scene.joint_names[joint]
+        for joint in map(int, np.flatnonzero(stiffness > 0))
+        if any(joints_of[body] > 1 for body in _moving_bodies(model, joint))
+        and stiffness[joint] * substep**2 > STIFFEST * _smallest_inertia(model, joint)
     ]
     if not stiff:
         return []
@@ -58,25 +60,22 @@ def _stiff_drives(model: Model) -> list[str]:
     ]
 
 
-def _shares_a_body(model: Model, joint: int) -> bool:
-    """Whether a moving body of a joint has others."""
-    scene = model.scene
-    ends = [{body for body in (entry.parent, entry.child) if not scene.static[body]} for entry in scene.joints]
-    return any(ends[joint] & others for others in itertools.chain(ends[:joint], ends[joint + 1 :]))
+def _moving_bodies(model: Model, joint: int) -> list[int]:
+    entry = model.scene.joints[joint]
+    return [body for body in (entry.parent, entry.child) if not model.scene.static[body]]
 
 
 def _smallest_inertia(model: Model, joint: int) -> float:
     """Of the moving bodies of a joint about its axis [kg m^2], or mass [kg] if it slides."""
-    scene, entry = model.scene, model.scene.joints[joint]
+    entry = model.scene.joints[joint]
     coordinate = JOINTS[entry.kind].coordinate
-    bodies = (entry.parent, entry.child)
     if coordinate is None or not coordinate.angular:
-        return min(float(model.mass[body]) for body in bodies if not scene.static[body])
+        return min(float(model.mass[body]) for body in _moving_bodies(model, joint))
     frames = (model.joint_frame_parent[joint], model.joint_frame_child[joint])
     return min(
         _inertia_about(model, body, rotate(np.asarray(frame, float), np.array([1.0, 0.0, 0.0])))
-        for body, frame in zip(bodies, frames, strict=True)
-        if not scene.static[body]
+        for body, frame in zip((entry.parent, entry.child), frames, strict=True)
+        if not model.scene.static[body]
     )
 
 

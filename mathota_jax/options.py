@@ -81,13 +81,13 @@ class Options:
         end of the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot
         stands on feet of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a
         broadphase or of many pairs for what touches at a time, and there are no other joints. Elsewhere three and more
-        joints, or fewer where a scene has nothing else to solve but what drives them, of which some are springs or
-        servos. "soft_step" sweeps joints in its small steps beside contacts, and closes them at the end. With the other
-        solvers one or two beside several contacts that bounce, and with all of them nets whose loops more than 96 rows
-        close, are left to the solver. Off: absent. Limits, motors, springs and friction on their joints are solved with
-        all that hangs on them, by `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred
-        times as heavy as its first link, a stop or a spring acts as it would on one rigid body. Springs and servos may
-        be as stiff as they like.
+        joints, or fewer where a scene has nothing else to solve, or has springs or servos among several rows that drive
+        them. "soft_step" sweeps joints in its small steps beside contacts, and closes them at the end. With the other
+        solvers other ones and twos, and with all of them nets whose loops more than 96 rows close, are left to the
+        solver. Off: absent. Limits, motors, springs and friction on their joints are solved with all that hangs on
+        them, by `velocity_iterations` sweeps of their own ("pgs"): on an arm whose end is a hundred times as heavy as
+        its first link, a stop or a spring acts as it would on one rigid body. Springs and servos may be as stiff as
+        they like.
         Without it an error travels one joint a sweep: ten links at 1/240 s part by 5e-3 of a link and twenty at 1/60 s gain
         energy without bound; with it no gap is left but round-off. A step of ten links with "pgs" takes 1.2 times as long.
       substeps: of "soft_step" alone; None for 4. The load that a contact sinks under falls with their square. Guide 12.3.

@@ -183,19 +183,13 @@ def _has_no_others(scene: Scene, found: Layout) -> bool:
     return not scene.slot_count and _row_count(found) == joint_row_count(scene)
 
 
-def _has_only_bounded(scene: Scene, found: Layout) -> bool:
-    """Whether all its others have bounds, or are soft, and act on these mechanisms."""
-    return not scene.slot_count and _row_count(found) + len(_bounded_slots(scene, found)) == joint_row_count(scene)
-
-
 def _has_stiff_drives(scene: Scene, found: Layout) -> bool:
-    """Whether all others have bounds, or are soft, and some are springs or servos that sweeps could not settle.
+    """Whether these mechanisms have springs or servos, beside one another or other rows, that sweeps could not settle.
 
     An arm of two links on servos, with stops, went round at 1e6 rad/s.
     """
     stiff = any(feature in STIFF for group in joint_groups(scene) for feature in group.features)
-    several = len(_bounded_slots(scene, found)) > 1
-    return scene.options.solver == "pgs" and stiff and several and _has_only_bounded(scene, found)
+    return scene.options.solver == "pgs" and stiff and len(_bounded_slots(scene, found)) > 1
 
 
 def _contact_places(scene: Scene, found: Layout) -> Places | None:
@@ -248,7 +242,9 @@ def takes_small_steps(scene: Scene) -> bool:
 def covers_with_bounds(scene: Scene) -> bool:
     """Whether it has no others than those and rows with bounds on mechanisms."""
     found = layout(scene)
-    return found is not None and _has_only_bounded(scene, found)
+    if found is None or scene.slot_count:
+        return False
+    return _row_count(found) + len(bounded_slots(scene)) == joint_row_count(scene)
 
 
 @functools.cache

@@ -77,8 +77,18 @@ def servo_arm(solver, links, mass, stiffness, contacts=False):
 @pytest.mark.parametrize("solver", slow_but(("pgs",), ("pgs", "soft_step", "converged")))
 def test_stiff_servos_rest_against_stops(precision, solver, links, gate):
     """Swept, two links of 0.1 kg with 1e4 N m/rad went round at 1e6 rad/s (default), and `soft_step` gave NaN."""
+    check_rest(precision, solver, links, gate, contacts=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("links", (1, 2, 3))
+def test_stiff_servos_rest_against_stops_beside_contacts(precision, links, gate):
+    check_rest(precision, "pgs", links, gate, contacts=True)
+
+
+def check_rest(precision, solver, links, gate, contacts):
     for mass, stiffness in ((1.0, 1e2), (1.0, 1e4), (0.1, 1e4)):
-        model, state = servo_arm(solver, links, mass, stiffness)
+        model, state = servo_arm(solver, links, mass, stiffness, contacts)
         _, record = rollout(model, state, jnp.ones((240, links)))
         last = jax.tree.map(lambda leaf: leaf[-30:], record)
         place = jax.vmap(joint_position, (None, 0))(model, last)
