@@ -90,7 +90,8 @@ def forces(model: Model, problem: Problem, impulses: tuple[Array, ...]) -> dict[
 def closing_force(model: Model, closed: Impulses) -> Array:
     """Mean joint forces (slot, world) of what closes mechanisms at the end of a step, see `close_joints`.
 
-    Sweeps in small steps leave to it a share of what the joints bear.
+    It turns the velocities with the joints, which those do that bear a swinging load: without it the tension of a pendulum
+    was 3 % off at 1/60 s, and in proportion to the step. Sweeps in small steps leave more to it.
     """
     found = layout(model.scene)
     assert found is not None

@@ -207,7 +207,7 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
         moved, closed = close_joints(model, bodies, moved, closed)
     found = forces(model, problem, impulses)
     ends = None if last is None or state.end_forces is None else end_forces(model, problem, state.end_forces, last)
-    if small and closed is not None:
+    if closed is not None:
         closing = closing_force(model, closed)
         found["joint_force"] = found["joint_force"] + closing
         if ends is not None:

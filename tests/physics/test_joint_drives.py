@@ -223,8 +223,8 @@ def test_tension_of_a_pendulum(precision, gate):
     middle = 0.5 * (bob[1:] + bob[:-1])
     along = -middle / np.linalg.norm(middle, axis=1, keepdims=True)
     truth = WEIGHT * (3 * along[:, 1] - 2 * np.cos(RELEASE))
-    gate("tension / weight - truth", (np.einsum("ti,ti->t", found["force"], along) - truth) / WEIGHT, 5e-3)
-    gate("across the rod / weight", np.cross(found["force"], along) / WEIGHT, 5e-3)
+    gate("tension / weight - truth", (np.einsum("ti,ti->t", found["force"], along) - truth) / WEIGHT, 1e-3)
+    gate("across the rod / weight", np.cross(found["force"], along) / WEIGHT, 1e-3)
     gate("torque [N m]", found["torque"], 1e-6)
 
 
