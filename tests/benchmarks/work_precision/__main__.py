@@ -52,7 +52,8 @@ def main(arguments: list[str] | None = None) -> int:
         for name in options.only or everything:
             print(f"{name} ...", flush=True)
             place = report["scenes"] if name in (*SCENES, GRADIENT.name) else report
-            place[name] = _measure(name, settings) | {"date": datetime.date.today().isoformat()}
+            today, processor = datetime.date.today().isoformat(), report["machine"]["processor"]
+            place[name] = _measure(name, settings) | {"date": today, "processor": processor}
             write(report, output)  # what is measured is kept, should the run be broken off
     write(report, output)
     print(summary(report["scenes"]))

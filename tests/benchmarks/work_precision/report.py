@@ -24,7 +24,7 @@ def markdown(report: dict) -> str:
         "",
         "Written by `python -m tests.benchmarks.work_precision`; do not edit. Every round is in `work_precision.json`.",
         "",
-        f"- Machine: {machine['processor']}, {machine['cores']} cores; {versions}",
+        f"- Machine: {machine['processor']}, {machine['cores']} cores{_other_processors(report)}; {versions}",
         f"- Run: {_dates(report)}, mode {settings['mode']}, up to {settings['rounds']} interleaved rounds; rates are "
         "medians of world-steps per CPU-second (`time.process_time`, all threads) over the whole horizon of the run whose "
         "error is given, after compilation; largest error over the worlds of a batch that differ",
@@ -52,9 +52,23 @@ def markdown(report: dict) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _parts(report: dict) -> dict:
+    """What was measured, by name."""
+    return report["scenes"] | {name: report[name] for name in ("features", "scaling") if name in report}
+
+
+def _other_processors(report: dict) -> str:
+    """Those of what was measured elsewhere: rates compare within a scene, not across machines."""
+    elsewhere: dict[str, list[str]] = {}
+    for name, part in _parts(report).items():
+        if part["processor"] != report["machine"]["processor"]:
+            elsewhere.setdefault(part["processor"], []).append(name)
+    return "".join(f" ({processor}: {', '.join(names)})" for processor, names in elsewhere.items())
+
+
 def _dates(report: dict) -> str:
     """Days of measurement, the latest first, and what was measured on all but that one."""
-    parts = report["scenes"] | {name: report[name] for name in ("features", "scaling") if name in report}
+    parts = _parts(report)
     latest, *others = sorted({part["date"] for part in parts.values()}, reverse=True)
     of_day = (", ".join(name for name, part in parts.items() if part["date"] == day) for day in others)
     return "; ".join((latest, *(f"{day}: {names}" for day, names in zip(others, of_day, strict=True))))
