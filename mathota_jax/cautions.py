@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import collections
-
 import numpy as np
 
+from mathota_jax.constraints.joint_layout import most_joints_of_a_body
 from mathota_jax.constraints.joints import JOINTS
 from mathota_jax.constraints.mechanism_layout import links_with_swept_contacts, takes_small_steps
 from mathota_jax.model import Model
@@ -44,12 +43,11 @@ def _stiff_drives(model: Model) -> list[str]:
         if entry.kind == "position":
             stiffness[entry.joint] += float(model.motor_stiffness[motor])
     substep = float(model.dt) / scene.options.substep_count
-    joints_of = collections.Counter(body for joint in range(len(scene.joints)) for body in _moving_bodies(model, joint))
+    swept_in_turn = (stiffness > 0) & (most_joints_of_a_body(scene) > 1)
     stiff = [
         scene.joint_names[joint]
-        for joint in map(int, np.flatnonzero(stiffness > 0))
-        if any(joints_of[body] > 1 for body in _moving_bodies(model, joint))
-        and stiffness[joint] * substep**2 > STIFFEST * _smallest_inertia(model, joint)
+        for joint in map(int, np.flatnonzero(swept_in_turn))
+        if stiffness[joint] * substep**2 > STIFFEST * _smallest_inertia(model, joint)
     ]
     if not stiff:
         return []
@@ -60,21 +58,17 @@ def _stiff_drives(model: Model) -> list[str]:
     ]
 
 
-def _moving_bodies(model: Model, joint: int) -> list[int]:
-    entry = model.scene.joints[joint]
-    return [body for body in (entry.parent, entry.child) if not model.scene.static[body]]
-
-
 def _smallest_inertia(model: Model, joint: int) -> float:
     """Of the moving bodies of a joint about its axis [kg m^2], or mass [kg] if it slides."""
     entry = model.scene.joints[joint]
     coordinate = JOINTS[entry.kind].coordinate
-    if coordinate is None or not coordinate.angular:
-        return min(float(model.mass[body]) for body in _moving_bodies(model, joint))
-    frames = (model.joint_frame_parent[joint], model.joint_frame_child[joint])
+    turns = coordinate is not None and coordinate.angular
+    sides = ((entry.parent, model.joint_frame_parent[joint]), (entry.child, model.joint_frame_child[joint]))
     return min(
         _inertia_about(model, body, rotate(np.asarray(frame, float), np.array([1.0, 0.0, 0.0])))
-        for body, frame in zip((entry.parent, entry.child), frames, strict=True)
+        if turns
+        else float(model.mass[body])
+        for body, frame in sides
         if not model.scene.static[body]
     )
 

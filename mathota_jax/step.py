@@ -206,14 +206,15 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     if layout(scene) is not None:
         moved, closed = close_joints(model, bodies, moved, closed)
     found = forces(model, problem, impulses)
-    ends = None if last is None or state.end_forces is None else end_forces(model, problem, state.end_forces, last)
-    if closed is not None:
-        closing = closing_force(model, closed)
+    closing = None if closed is None else closing_force(model, closed)
+    if closing is not None:
         found["joint_force"] = found["joint_force"] + closing
-        if ends is not None:
-            ends = dataclasses.replace(ends, joint_force=ends.joint_force + closing)
     new = new_state(scene, state, moved, found, failed)
-    if ends is not None:
+    if last is not None:
+        assert state.end_forces is not None
+        ends = end_forces(model, problem, state.end_forces, last)
+        if closing is not None:
+            ends = dataclasses.replace(ends, joint_force=ends.joint_force + closing)
         new = dataclasses.replace(new, end_forces=ends)
     new = let_sleep(model, state, new, action, problem) if scene.options.sleep else new
     return new, Solved(None, None if closed is None else Solutions(held, closed), uncut)

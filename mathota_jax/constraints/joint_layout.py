@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from typing import NamedTuple
 
 import numpy as np
@@ -64,6 +65,13 @@ def joint_groups(scene: Scene) -> list[JointGroup]:
 def joint_row_count(scene: Scene) -> int:
     """Number of joint rows of a scene."""
     return sum(group.row_count * len(group.joints) for group in joint_groups(scene))
+
+
+def most_joints_of_a_body(scene: Scene) -> np.ndarray:
+    """(joint,) how many joints that of its moving bodies has which has most."""
+    ends = [(joint.parent, joint.child) for joint in scene.joints]
+    counts = collections.Counter(body for end in ends for body in end if not scene.static[body])
+    return np.array([max(counts[body] for body in end) for end in ends])
 
 
 def joint_tables(scene: Scene) -> tuple[Table, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import functools
 
@@ -16,7 +15,7 @@ from mathota_jax.constraints.assembly import pack_scalars, smaller_side
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.joint import JointMotion
-from mathota_jax.constraints.joint_layout import joint_groups
+from mathota_jax.constraints.joint_layout import joint_groups, most_joints_of_a_body
 from mathota_jax.constraints.joints.rows import HOLD, STOP
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -69,9 +68,7 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
 
 def _branches(scene: Scene) -> np.ndarray:
     """(slot,) whether each joint row belongs to a joint of a moving body that has more than two."""
-    ends = [(joint.parent, joint.child) for joint in scene.joints]
-    counts = collections.Counter(body for end in ends for body in end if not scene.static[body])
-    branches = np.array([max(counts[body] for body in end) > 2 for end in ends])
+    branches = most_joints_of_a_body(scene) > 2
     return np.concatenate([np.tile(branches[list(group.joints)], group.row_count) for group in joint_groups(scene)])
 
 

@@ -1,5 +1,6 @@
 """Motors and servos that drive into the stops of their joints, against statics: none yields to the other."""
 
+import dataclasses
 import warnings
 
 import jax
@@ -9,7 +10,7 @@ import pytest
 
 from mathota_jax import Box, Hinge, Plane, SceneBuilder, Sphere, joint_forces, joint_position, joint_velocity, rollout
 from tests.marks import QUICK_AND_SLOW_PRECISION, slow_but
-from tests.scenes import DOWN, GRAVITY, undamped
+from tests.scenes import DOWN, GRAVITY, stiffened, undamped
 
 LENGTH, HALF, MASS, STOP, DT = 0.4, 0.02, 1.0, 0.3, 1 / 240
 
@@ -55,8 +56,13 @@ def test_a_motor_holds_its_joint_at_the_stop_and_leaves_it_as_told(solver, cap, 
     assert not record.flags.any()
 
 
-def servo_arm(solver, links, mass, stiffness, contacts=False):
-    """Links in a row along x, whose critically damped servos want 1 rad, beyond their stops."""
+def critical(stiffness, mass):
+    """Damping of a lone link about its end [N m s/rad]."""
+    return 2 * np.sqrt(stiffness * mass * LENGTH**2 / 3)
+
+
+def servo_arm(solver, links, stiffness, contacts=False):
+    """Links of 1 kg in a row along x, whose critically damped servos want 1 rad, beyond their stops."""
     builder = SceneBuilder(gravity=DOWN)
     last = builder.add_body(Sphere(0.02), static=True, collides=False)
     if contacts:
@@ -64,10 +70,9 @@ def servo_arm(solver, links, mass, stiffness, contacts=False):
         builder.add_body(Sphere(0.1), mass=1.0, position=(0, -4.9, 0))
     for link in range(links):
         place = (LENGTH * (link + 0.5), 0, 0)
-        body = builder.add_body(Box((LENGTH / 2, HALF, HALF)), mass=mass, position=place, collides=False)
+        body = builder.add_body(Box((LENGTH / 2, HALF, HALF)), mass=MASS, position=place, collides=False)
         joint = builder.add_joint(Hinge(last, body, (LENGTH * link, 0, 0), (0, 0, 1), limits=(-1.0, STOP)))
-        damping = 2 * np.sqrt(stiffness * mass * LENGTH**2 / 3)
-        builder.add_motor(joint, kind="position", stiffness=stiffness, damping=damping)
+        builder.add_motor(joint, kind="position", stiffness=stiffness, damping=critical(stiffness, MASS))
         last = body
     return builder.build(undamped(dt=1 / 60, solver=solver))
 
@@ -87,8 +92,10 @@ def test_stiff_servos_rest_against_stops_beside_contacts(precision, links, gate)
 
 
 def check_rest(precision, solver, links, gate, contacts):
+    built, state = servo_arm(solver, links, 1e2, contacts)
     for mass, stiffness in ((1.0, 1e2), (1.0, 1e4), (0.1, 1e4)):
-        model, state = servo_arm(solver, links, mass, stiffness, contacts)
+        model = stiffened(built, "servo", stiffness, critical(stiffness, mass))
+        model = dataclasses.replace(model, mass=mass * built.mass, inertia=mass * built.inertia)
         _, record = rollout(model, state, jnp.ones((240, links)))
         last = jax.tree.map(lambda leaf: leaf[-30:], record)
         place = jax.vmap(joint_position, (None, 0))(model, last)
@@ -103,9 +110,9 @@ def check_rest(precision, solver, links, gate, contacts):
 
 def test_build_warns_of_drives_too_stiff_for_small_steps():
     with pytest.warns(UserWarning, match=r"spring or servo of 'joint0' \(2 such joints\) is too stiff for small steps"):
-        servo_arm("soft_step", 2, 1.0, 1e4, contacts=True)
+        servo_arm("soft_step", 2, 1e4, contacts=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        servo_arm("soft_step", 2, 1.0, 1e2, contacts=True)
-        servo_arm("soft_step", 1, 1.0, 1e4, contacts=True)
-        servo_arm("soft_step", 2, 1.0, 1e4)
+        servo_arm("soft_step", 2, 1e2, contacts=True)
+        servo_arm("soft_step", 1, 1e4, contacts=True)
+        servo_arm("soft_step", 2, 1e4)
