@@ -185,6 +185,29 @@ def test_derivatives_of_a_sled(float64, gate, mode):
     gate("derivatives / truth - 1", derivatives_of_way(*slide(), mode) - 1, 1e-4)
 
 
+@pytest.mark.parametrize("mode", slow_but((jax.jacrev,), (jax.jacrev, jax.jacfwd)))
+def test_derivatives_on_fewer_rows_than_coordinates(float64, gate, mode):
+    """A block welded on a ball: where it rests, all is lifted by what the ball grows; without friction it goes on.
+
+    Of few rows the whole matrix is kept: derivatives of the correction of positions raised an error.
+    """
+    builder = on_ground(friction=0.0)
+    bodies = leg(builder, LIGHT[:2], speed=2.0, friction=0.0, shape=Sphere(0.02))
+    model, state = builder.build(undamped(dt=1 / 240))
+    assert mechanism_layout.takes_contacts(model.scene)
+
+    def place(speed, radius):
+        moving = state.velocity.at[jnp.asarray(bodies), 0].set(speed)
+        shapes = {**model.shapes, "sphere": {**model.shapes["sphere"], "radius": jnp.full((1,), radius)}}
+        changed = dataclasses.replace(model, shapes=shapes)
+        final = rollout(changed, dataclasses.replace(state, velocity=moving), 60)[0]
+        return final.position[bodies[-1], :2]
+
+    by_speed, by_radius = jax.jit(mode(place, (0, 1)))(2.0, 0.02)
+    gate("way, height by speed [s]", np.asarray(by_speed) - [60 / 240, 0.0], 1e-6)
+    gate("way, height by radius", np.asarray(by_radius) - [0.0, 1.0], 1e-6)
+
+
 @pytest.mark.slow
 def test_a_table_on_driven_legs(precision, gate):
     """Legs that motors hold still bear the weight; they may share it as they like. The usual sweeps move it by 0.3 mm."""
