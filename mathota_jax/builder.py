@@ -333,7 +333,13 @@ class SceneBuilder:
             )
             if scene.options.sleep
             else None,
-            end_forces=EndForces(jnp.copy(contact_force), jnp.copy(joint_force)) if takes_small_steps(scene) else None,
+            end_forces=EndForces(
+                contact_force=jnp.copy(contact_force),
+                joint_force=jnp.copy(joint_force),
+                time=_floats(scene.options.dt / scene.options.substep_count),
+            )
+            if takes_small_steps(scene)
+            else None,
         )
 
     def _pair_groups(self, table: ShapeTable, planned: frozenset[int], ignored: Filter) -> tuple[PairGroup, ...]:

@@ -102,8 +102,9 @@ def closing_force(model: Model, closed: Impulses) -> Array:
 def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tuple[Array, ...]) -> EndForces:
     """Mean forces over the last substep, from its impulses."""
     scene = model.scene
-    found = _mean_forces(scene, problem, impulses, model.dt / scene.options.substep_count)
-    return dataclasses.replace(before, **found)
+    time = model.dt / scene.options.substep_count
+    found = _mean_forces(scene, problem, impulses, time)
+    return dataclasses.replace(before, time=jnp.broadcast_to(time, before.time.shape), **found)
 
 
 def _mean_forces(scene: Scene, problem: Problem, impulses: tuple[Array, ...], time: Array) -> dict[str, Array]:

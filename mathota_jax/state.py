@@ -72,10 +72,12 @@ class EndForces:
     Attributes:
       contact_force: (slot, 3) on body B of each contact slot, mean of the last substep [N], world frame.
       joint_force: (joint row,) mean generalized force of the last substep [N] or [N m].
+      time: () length of that substep [s].
     """
 
     contact_force: Array
     joint_force: Array
+    time: Array
 
 
 @pytree

@@ -6,7 +6,7 @@ import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, merge, moving, vector
 from mathota_jax.collision.narrowphase import ContactSet, join_contacts
@@ -35,6 +35,10 @@ from mathota_jax.solver.soft_laws import PositionError
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.vector import Vec3
 from mathota_jax.state import State
+
+LARGEST_GROWTH = 2.0
+"""Of a substep over the last one, up to which it starts from the same forces; from those of a step far shorter, which may
+be those of a push-out or a stop that is over, it starts with what they did in so much longer."""
 
 
 class Forces(NamedTuple):
@@ -180,13 +184,17 @@ def starting_impulses(
     if not model.scene.options.warm_start:
         return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows), jnp.zeros_like(velocity)
     last = state if state.end_forces is None else state.end_forces
-    if problem.contacts is None:
-        return _impulses(model, problem, last.joint_force, None), None
-    force = matched_force(model.scene, problem.contacts, problem.offsets, problem.close, state, last.contact_force)
+    force = None
+    if problem.contacts is not None:
+        force = matched_force(model.scene, problem.contacts, problem.offsets, problem.close, state, last.contact_force)
     start = _impulses(model, problem, last.joint_force, force)
-    if model.scene.options.solver != "soft_step":
-        return warm_start.plausible(problem.rows, inertia, velocity, start)
-    return start, None
+    if state.end_forces is not None:
+        longer = model.dt / model.scene.options.substep_count / state.end_forces.time
+        share = lax.stop_gradient(jnp.minimum(LARGEST_GROWTH / longer, 1.0))
+        return tuple(impulse * share for impulse in start), None
+    if problem.contacts is None or model.scene.options.solver == "soft_step":
+        return start, None
+    return warm_start.plausible(problem.rows, inertia, velocity, start)
 
 
 def known_impulses(model: Model, problem: Problem, solved: Forces) -> tuple[Array, ...]:

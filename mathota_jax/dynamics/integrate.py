@@ -8,10 +8,10 @@ from jax import Array
 
 from mathota_jax.bodies import Bodies, Inertia, unpack_blocks
 from mathota_jax.dynamics.free_motion import rotate_at_constant_momentum
-from mathota_jax.spatial.quaternion import exponential, multiply, normalize, rotate, turn_between
+from mathota_jax.spatial.quaternion import exponential, multiply, normalize, rotate, to_matrix, turn_between
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
-from mathota_jax.spatial.settle import compute_once, materialize
-from mathota_jax.spatial.vector import Vec3, dot
+from mathota_jax.spatial.settle import compute_once, materialize, settle
+from mathota_jax.spatial.vector import Vec3, dot, where
 
 
 def advance(
@@ -88,6 +88,8 @@ def advance(
         angular = angular * _energy_scale(
             acting, free_angular if solved_angular is None else solved_angular, angular, end, turn
         )
+        if solved_angular is not None:
+            angular = _without_gain(bodies.orientation if halfway is None else halfway.orientation, orientation, acting, solved_angular, angular, end)
         # Else its expressions end in the array of the new state, and are worked out element by element.
         angular = materialize(angular)
         turn = inertia.rotation.apply(turn) if halfway is None else turn
@@ -105,6 +107,16 @@ def _energy_scale(inertia: Inertia, before: Vec3, after: Vec3, momentum: Vec3, t
     energy, found = dot(before, inertia.apply(before)), dot(after, momentum)
     ratio = safe_divide(energy, jnp.where(unresolved, found, 1.0))
     return jnp.where(unresolved, safe_sqrt(ratio), 1.0)
+
+
+GAIN = 0.01
+
+
+def _without_gain(start, orientation, inertia: Inertia, before: Vec3, after: Vec3, momentum: Vec3) -> Vec3:
+    energy, found = dot(before, inertia.apply(before)), dot(after, momentum)
+    gains = settle(jnp.where(found > (1.0 + GAIN) * energy, 1.0, 0.0)) > 0.5
+    carried = to_matrix(orientation).apply(to_matrix(start).apply_transposed(before))
+    return where(gains, carried, after)
 
 
 def displace(bodies: Bodies, inertia: Inertia, displacement: Array) -> Bodies:
