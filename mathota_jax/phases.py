@@ -405,16 +405,34 @@ def close_joints(
 
 
 def stop_at_impacts(
-    model: Model, bodies: Bodies, inertia: Inertia, moved: Bodies, displacement: tuple[Vec3, Vec3]
+    model: Model, bodies: Bodies, inertia: Inertia, moved: Bodies, displacement: tuple[Vec3, Vec3], force: Vec3
 ) -> Bodies:
-    """Fast bodies stop at the first touch on their way (guide 10.4), mechanisms as a whole."""
+    """Fast bodies stop at the first touch on their way (guide 10.4), mechanisms as a whole.
+
+    `force` is the external one on the moving bodies, without gravity.
+    """
     scene = model.scene
     motion = events.Motion(bodies.position, bodies.orientation, *(of_all_bodies(scene, part) for part in displacement))
     trees = ()
     if (found := layout(scene)) is not None:
         trees = tuple(tuple(scene.dynamic_bodies[found.blocks[link]] for link in tree) for tree in found.trees)
     stopped = moving(scene, events.stop_at_impacts(model, motion, merge(scene, bodies, moved), trees))
+    lost = moved.position - stopped.position
+    acceleration = gravity(model) + force * inertia.inverse_mass
+    stopped = stopped._replace(velocity=_speed_before(moved.velocity, acceleration, lost))
     return stopped if inertia.rotation is None else _keep_spin(inertia, moved, stopped)
+
+
+def _speed_before(velocity: Vec3, acceleration: Vec3, way: Vec3) -> Vec3:
+    """Velocities before a constant acceleration acted along a way, ``u^2 = v^2 - 2 a s`` along it.
+
+    A ball that stops short of the ground has not fallen the rest: with the speed of the end of the step it would gain that
+    energy at each bounce.
+    """
+    squared, along = dot(acceleration, acceleration), dot(velocity, acceleration)
+    before = safe_sqrt(jnp.maximum(along * along - 2.0 * squared * dot(way, acceleration), 0.0))
+    before = jnp.where(dot(way, way) > 0, jnp.where(along < 0, -before, before), along)
+    return velocity + acceleration * safe_divide(before - along, squared)
 
 
 def _keep_spin(inertia: Inertia, moved: Bodies, stopped: Bodies) -> Bodies:

@@ -202,7 +202,7 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     if not small:
         moved = correct_positions(model, problem, bodies, inertia, moved, displacement)
     if scene.options.continuous and scene.pair_groups:
-        moved = stop_at_impacts(model, bodies, inertia, moved, displacement)
+        moved = stop_at_impacts(model, bodies, inertia, moved, displacement, force)
     if layout(scene) is not None:
         moved, closed = close_joints(model, bodies, moved, closed)
     found = forces(model, problem, impulses)

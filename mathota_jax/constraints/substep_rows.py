@@ -59,7 +59,9 @@ def joint_error(scene: Scene, rows: Rows, model: Model, motion: JointMotion, dec
     moves = functools.reduce(jnp.logical_or, [take(part, slots) != 0 for part in linear])
     branches = _branches(scene)[slots]
     radius = pack_scalars(table, [_smallest_radius(scene, rows, model)], worlds)
-    limit = _push_out_rate(model) * jnp.where(pack_scalars(table, [moves.astype(radius.dtype)], worlds) > 0, radius, 1.0)
+    limit = _push_out_rate(model) * jnp.where(
+        pack_scalars(table, [moves.astype(radius.dtype)], worlds) > 0, radius, 1.0
+    )
     return PositionError(
         start=packed(take(motion.start.error, slots)),
         limit=limit,
