@@ -22,11 +22,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_tolerance, pick
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import (
+    NEIGHBOURS,
     Window,
     grid_window,
     ground_at,
@@ -47,6 +49,10 @@ SEAM = 1e-5
 """Triangles overlap by this share of a cell, so that no point falls between them."""
 FLAT = 1e-5
 """A grid point must stand out of its neighbours' plane by this share of a cell to be a peak."""
+LEANING = 0.02
+"""Sine by which a direction may look into the ground at a grid point of a ridge or a rim. Under a body that lies flat on a
+ridge it does so at all points but the highest: with that alone the body would rock on one point after the other, and what
+lies on a plateau that is smaller would have no corner below it."""
 MERGE = 1e-3
 """Contacts closer than this share of the body's size, normals included, are one."""
 HEIGHT_WEIGHT = 10.0
@@ -197,10 +203,20 @@ def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window) -> Ca
     direction = lax.stop_gradient(up)
     cell = lax.stop_gradient(window.field["cell_size"])
     valid = complete & (direction.y > 0)
+    slack = jnp.where(_bends_down(ways, cell), LEANING, -FLAT) * cell
     for way, present in ways:
-        valid &= ~present | (dot(direction, lax.stop_gradient(way)) < -FLAT * cell)
+        valid &= ~present | (dot(direction, lax.stop_gradient(way)) < slack)
     valid = settle(valid.astype(separation.dtype)) > 0.5
     return Candidates(points, up, separation, 7 * _grid_count(window) + number, valid)
+
+
+def _bends_down(ways: list[tuple[Vec3, np.ndarray]], cell: Array) -> Array:
+    """Whether the ground (point, pair, world) is bent downwards at a point, along some line through it."""
+    bends = jnp.zeros((), bool)
+    for k, (i, j) in enumerate(NEIGHBOURS):
+        (way, present), (back, behind) = ways[k], ways[NEIGHBOURS.index((-i, -j))]
+        bends = bends | (present & behind & (lax.stop_gradient(way.y + back.y) < -FLAT * cell))
+    return bends
 
 
 def _base(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -80,6 +81,9 @@ def _rows(
         jacobians, responses = decoupling.sides(jacobians), decoupling.sides(responses)
     slots = np.maximum(table.order, 0)
     laws, angular = (values[slots] for values in (motion.start.laws, motion.start.angular))
+    if decoupling is not None and not np.isin(laws, CORRECTED).all():
+        # With the derivatives that it owes to the bodies: springs and dampers respond by it.
+        mass = _mass(jacobians, responses)
     error, rate, coefficients = select(table, (motion.start.error, motion.start.rate, motion.coefficients))
     felt = mass if motion.responses is None else _with_trees(scene, slots, mass, motion.responses)
     # An error turned into velocity whips a chain that starts open, and feeds a loop that can not close without bound. The
@@ -172,8 +176,10 @@ def _position_laws(
     laws = joints.laws[slots]
     one_sided = laws == STOP
     free = np.where(np.isin(laws, CORRECTED) & ~np.isin(slots, left_out), np.inf, 0.0)
+    # Others are void. Of bounds that leave nothing alone derivatives make a tie, at rest, and a share of a row.
+    works = (free > 0) | (one_sided & ~np.isin(slots, left_out))
     law = Bounded(
-        effective_mass=jax.lax.stop_gradient(pack_scalars(table, [1.0 / mass], worlds)),
+        effective_mass=jax.lax.stop_gradient(pack_scalars(table, [jnp.where(works[:, None], 1.0 / mass, 0.0)], worlds)),
         softness=_bounds(table, np.zeros(one_sided.shape)),
         lower=_bounds(table, np.where(one_sided, 0.0, -free)),
         upper=_bounds(table, free),
@@ -205,8 +211,11 @@ def _sides(scene: Scene, table: Table, joints: JointRows, inertia: Inertia) -> t
     else:
         jacobians = [_moving_side(scene, table, joints)]
     responses = [respond(j, select_blocks(table, side, inertia)) for side, j in enumerate(jacobians)]
-    mass = sum((inner(j, r) for j, r in zip(jacobians, responses, strict=True)), jnp.zeros(()))
-    return jacobians, responses, mass
+    return jacobians, responses, _mass(jacobians, responses)
+
+
+def _mass(jacobians: Sequence[Side], responses: Sequence[Side]) -> Array:
+    return sum((inner(j, r) for j, r in zip(jacobians, responses, strict=True)), jnp.zeros(()))
 
 
 def _moving_side(scene: Scene, table: Table, joints: JointRows) -> Side:

@@ -68,9 +68,11 @@ def rate_to_stop(room: Array, opening: Array, dt: Array) -> Array:
     """Largest rate at the end of the step towards a stop, from the room left before it and the rate at which that grows.
 
     The room left changes by ``dt (start + end) / 2``: the rate at the end may just close it, and is 0 where the present
-    rate would close it in less than half the step.
+    rate would close it in less than half the step. At the stop itself derivatives are those of what it holds.
     """
-    return jnp.maximum(2.0 * jnp.maximum(room, 0.0) / dt + opening, 0.0)
+    room = jnp.where(room < 0, 0.0, room)
+    rate = 2.0 * room / dt + opening
+    return jnp.where(rate < 0, 0.0, rate)
 
 
 def _stop(columns: Columns) -> Response:

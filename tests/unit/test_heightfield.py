@@ -1,6 +1,7 @@
 """Convex shapes against heightfields: float64 oracles, the plane as the limit of flat ground, derivatives, scenes."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mathota_jax import Box, Capsule, Heightfield, Options, Plane, Polyhedron, SceneBuilder, Sphere, step
+from mathota_jax import Box, Capsule, Heightfield, Options, Plane, Polyhedron, SceneBuilder, Sphere, rollout, step
 from mathota_jax.collision.height_grid import window_size
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.collision.pairs.plane_box import plane_box
@@ -25,6 +26,7 @@ from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3
 from tests.hulls import hull
 from tests.marks import slow_but
+from tests.scenes import undamped
 
 FUNCTIONS = {
     "sphere": plane_sphere,
@@ -502,6 +504,43 @@ def test_bodies_come_to_rest_on_hills(name):
     assert above.min() > 0.0, "the centre fell into the ground"
     speed = np.linalg.norm(velocity[-100:], axis=1).max()
     assert speed < (1.0 if name == "capsule" else 1e-3)  # a capsule has nothing that stops it from rolling
+
+
+@pytest.mark.parametrize("ground", ["plateau", "wall", "ridges"])
+def test_a_face_rests_on_what_is_smaller(ground, gate):
+    """Box fell through a plateau, whose corners lie under its face alone, and rocked for ever on ridges."""
+    heights = np.zeros((13, 13))
+    if ground == "ridges":
+        heights[1::2] = 0.2
+    else:
+        heights[(slice(5, 8), slice(5, 8) if ground == "plateau" else slice(None))] = 0.2
+    model, state = box_over_ground()
+    field = {**model.shapes["heightfield"], "heights": jnp.asarray(heights[None], state.position.dtype)}
+    model = dataclasses.replace(model, shapes={**model.shapes, "heightfield": field})
+    for angle, lift in ((0.0, 0.001), (0.01, 0.001), (0.03, 0.5)):
+        tilt = jnp.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)], state.position.dtype)
+        start = dataclasses.replace(
+            state,
+            position=state.position.at[1, 1].add(lift),
+            orientation=state.orientation.at[1].set(tilt),
+        )
+        final = fall(model, start)
+        gate("height over its rest [m]", final.position[1, 1] - 0.25, 1e-4)
+        gate("rate [rad/s]", final.angular_velocity[1], 1e-3)
+
+
+@functools.cache
+def box_over_ground():
+    builder = SceneBuilder()
+    builder.add_body(Heightfield(np.zeros((13, 13)), 0.2), static=True, friction=0.7)
+    builder.add_body(Box((0.4, 0.05, 0.4)), mass=1.0, position=(0, 0.25, 0), friction=0.7)
+    return builder.build(undamped(dt=1 / 120))
+
+
+@jax.jit
+def fall(model, state):
+    """Three seconds; one program for all grounds."""
+    return rollout(model, state, 360)[0]
 
 
 def test_sphere_rolls_in_a_bowl(gate):
