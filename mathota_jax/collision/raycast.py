@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.batching import batch_last
 from mathota_jax.bodies import unpack
@@ -13,6 +15,7 @@ from mathota_jax.collision.placement import shape_parameters, shape_poses
 from mathota_jax.collision.ray_frame import RayHit, far
 from mathota_jax.collision.rays import RAYS
 from mathota_jax.model import Model
+from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle_code
 from mathota_jax.spatial.vector import Vec3, normalize
 from mathota_jax.state import State
@@ -78,7 +81,9 @@ def raycast(
 def _raycast(model: Model, state: State, origin: Array, direction: Array, max_distance: Array) -> Raycast:
     scene, bodies = model.scene, unpack(state)
     start, heading = (Vec3(*(value[axis][None] for axis in range(3))) for value in (origin, direction))
-    heading = normalize(heading)
+    # Of a length whose square is a number.
+    largest = lax.stop_gradient(functools.reduce(jnp.maximum, heading.map(jnp.abs)))
+    heading = normalize(heading * safe_divide(jnp.ones_like(largest), largest))
     worlds = np.broadcast_shapes(*(value.shape[-1:] for value in (state.position, origin, direction, max_distance)))
     found: list[RayHit] = []
     owners: list[int] = []

@@ -166,7 +166,9 @@ def ray_cone(cone: dict[str, Any], pose: Pose, origin: Vec3, direction: Vec3) ->
     x, z = ray.origin.x + at * ray.direction.x, ray.origin.z + at * ray.direction.z
     across = norm(Vec3(x, jnp.zeros_like(x), z))
     scale = 1.0 / jnp.sqrt(1.0 + slope * slope)
-    side = Vec3(safe_divide(x, across) * scale, slope * scale + 0.0 * x, safe_divide(z, across) * scale)
+    # The apex has many normals: the axis is one.
+    rise = jnp.where(across > 0, slope * scale, 1.0)
+    side = Vec3(safe_divide(x, across) * scale, rise, safe_divide(z, across) * scale)
     return hit_at(pose, ray, code, parameter, _choose(code, [side, _cap(ray)]))
 
 

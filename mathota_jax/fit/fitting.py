@@ -107,7 +107,9 @@ def fit(
     objective = Objective(model, state, vector, data, noise, segments, substeps, start, spread)
     if not objective.used:
         raise ValueError("fit: no recorded channel has a noise; nothing is compared")
-    begin = vector.random_starts(start_count, seed)
+    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
+        raise ValueError(f"fit: seed must be a whole number of at least 0, got {seed!r}")
+    begin = vector.random_starts(start_count, int(seed))
     return solve(objective, begin, horizons, huber, optimiser, step_limit, confidence, progress)
 
 

@@ -144,7 +144,9 @@ def parameter_vector(model: Model, state: State, parameters: Sequence[Parameter 
 
 
 def _place(model: Model, state: State, parameter: Parameter, begin: int, seen: set[tuple[str, int]]) -> Place:
-    names = (parameter.name,) if isinstance(parameter.name, str) else tuple(parameter.name)
+    names = (parameter.name,) if isinstance(parameter.name, str) else parameter.name
+    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"fit: the name of a Parameter must be a string or a tuple of them, got {parameter.name!r}")
     if not names:
         raise ValueError("fit: a tied parameter needs at least one name, got ()")
     targets, kinds = [], []
@@ -158,8 +160,9 @@ def _place(model: Model, state: State, parameter: Parameter, begin: int, seen: s
     if len(set(kinds)) > 1:
         raise ValueError(f"fit: tied parameters must be of one quantity, got {', '.join(names)}")
     quantity, index = targets[0]
-    start = np.asarray(quantity.read(model, state, index) if parameter.start is None else parameter.start, float)
-    shape = np.shape(quantity.read(model, state, index))
+    own = quantity.read(model, state, index)
+    start = _numbers("start", parameter, own if parameter.start is None else parameter.start)
+    shape = np.shape(own)
     if start.shape != shape and start.shape != ():
         raise ValueError(f"fit: start of '{parameter.label}' must have shape {shape}, got {start.shape}")
     start = np.broadcast_to(start, shape)
@@ -195,6 +198,13 @@ def _target(model: Model, name: Any) -> tuple[str, Quantity, int]:
     return kind, quantity, index
 
 
+def _numbers(what: str, parameter: Parameter, value: Any) -> np.ndarray:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"fit: {what} of '{parameter.label}' must be a number, got {value!r}") from None
+
+
 def _owner(model: Model, name: str, noun: str, owner: str | None) -> int:
     scene = model.scene
     known = {
@@ -207,15 +217,20 @@ def _owner(model: Model, name: str, noun: str, owner: str | None) -> int:
         raise ValueError(f"fit: parameter '{name}' needs a {noun} in brackets; known: {listed}")
     if owner in known:
         return known.index(owner)
-    if owner.isdigit() and int(owner) < len(known):
+    if owner.isdecimal() and int(owner) < len(known):
         return int(owner)
     raise ValueError(f"fit: parameter '{name}': no {noun} is called '{owner}'; known: {listed}")
 
 
 def _transform(parameter: Parameter, quantity: Quantity, start: np.ndarray) -> tuple[Transform, tuple[float, float]]:
     label = parameter.label
-    lower = quantity.lower if parameter.lower is None else float(parameter.lower)
-    upper = quantity.upper if parameter.upper is None else float(parameter.upper)
+    lower, upper = (
+        own if given is None else float(_numbers(f"bound '{name}'", parameter, given))
+        for name, own, given in (
+            ("lower", quantity.lower, parameter.lower),
+            ("upper", quantity.upper, parameter.upper),
+        )
+    )
     if not lower < upper or lower < quantity.lower or upper > quantity.upper:
         raise ValueError(
             f"fit: bounds of '{label}' must be increasing and between {quantity.lower:g} and {quantity.upper:g}, "

@@ -119,9 +119,11 @@ def _perturbations(
     """Flat parameters, their inverse, deviations (entry,) and standard normal noise (pair, entry)."""
     if isinstance(pairs, bool) or not isinstance(pairs, int) or pairs < 2:
         raise ValueError(f"{name}: pairs must be an integer of at least 2, got {pairs!r}")
+    # Leaf by leaf: flattening makes floats of integers beside floats, and unravelling integers of what is added to them.
+    for leaf in jax.tree.leaves(parameters):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            raise ValueError(f"{name}: the parameters must be floats, got {jnp.result_type(leaf)}")
     flat, unravel = ravel_pytree(parameters)
-    if not jnp.issubdtype(flat.dtype, jnp.floating):
-        raise ValueError(f"{name}: the parameters must be floats, got {flat.dtype}")
     if jax.tree.structure(deviation) == jax.tree.structure(parameters):
         spread = ravel_pytree(jax.tree.map(lambda s, p: jnp.broadcast_to(s, jnp.shape(p)), deviation, parameters))[0]
     else:

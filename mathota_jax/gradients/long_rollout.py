@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -60,8 +61,10 @@ def long_rollout(
     check_leaves("long_rollout", model, state)
     actions = check_actions("long_rollout", model, state, actions)
     for name, value in (("segment", segment), ("window", window)):
-        if value is not None and value < 1:
-            raise ValueError(f"long_rollout: {name} must be at least 1 step, got {value}")
+        if value is None:
+            continue
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"long_rollout: {name} must be a whole number of at least 1 step, got {value!r}")
     count = actions.shape[0]
     segment = min(segment or max(1, math.isqrt(count)), max(count, 1))
 

@@ -124,6 +124,7 @@ def test_deviations_of_each_entry(float64):
         ({"pairs": 1}, "pairs must be an integer of at least 2, got 1"),
         ({"deviation": 0.0}, "every deviation must be positive"),
         ({"parameters": jnp.array([1])}, "the parameters must be floats"),
+        ({"parameters": {"count": jnp.array([1]), "speed": 1.0}}, "the parameters must be floats, got int"),
         ({"tolerance": -1.0}, "tolerance must be at least 0"),
     ],
 )

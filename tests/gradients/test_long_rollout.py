@@ -151,8 +151,9 @@ def test_cotangents_that_are_not_finite_are_not_hidden():
     [
         ({"actions": -1}, "number of steps must be an integer of at least 0"),
         ({"actions": np.zeros((3, 2))}, r"actions must have shape \(steps, 1\)"),
-        ({"actions": 3, "segment": 0}, "segment must be at least 1 step, got 0"),
-        ({"actions": 3, "window": 0}, "window must be at least 1 step, got 0"),
+        ({"actions": 3, "segment": 0}, "segment must be a whole number of at least 1 step, got 0"),
+        ({"actions": 3, "segment": 2.5}, "segment must be a whole number of at least 1 step, got 2.5"),
+        ({"actions": 3, "window": 0}, "window must be a whole number of at least 1 step, got 0"),
         ({"actions": 3, "largest_norm": 0.0}, "largest_norm must be positive"),
     ],
 )

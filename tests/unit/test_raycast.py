@@ -217,6 +217,24 @@ def test_rays_from_afar_are_met_in_float32():
             assert float(found.distance[0]) == pytest.approx(full - short + expected[0], abs=3e-4)
 
 
+def test_directions_of_any_length_are_met():
+    """The square of 1e-25 and of 1e25 is no number in float32."""
+    with jax.enable_x64(False):
+        model, state = scene(Sphere(0.4), np.zeros(3), Rotation.identity())
+        lengths = np.array([1e-30, 1e-20, 1.0, 1e20, 1e30])
+        found = cast(model, state, np.tile([0.0, 0.0, 2.0], (5, 1)), lengths[:, None] * [0.0, 0.0, -1.0])
+        np.testing.assert_allclose(found.distance, 1.6, rtol=1e-6)
+
+
+def test_the_apex_of_a_cone_has_a_normal():
+    found = cast(
+        *scene(Cone(0.35, 0.3), np.zeros(3), Rotation.identity()),
+        np.array([[0.0, 2.0, 0.0]]),
+        np.array([[0.0, -1.0, 0.0]]),
+    )
+    np.testing.assert_allclose(found.normal, [[0.0, 1.0, 0.0]], atol=1e-6)
+
+
 def test_no_ray_slips_through_a_seam(precision):
     """Rays at edges and corners of a mesh-like surface, straight and askew."""
     hills = SHAPE["heightfield"]
