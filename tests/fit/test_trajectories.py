@@ -94,6 +94,7 @@ def ball_data(**changes):
         (ball_data(), {"segments": 2, "horizons": (0.5, 1.0)}, "not both"),
         (ball_data(), {"horizons": (0.5, 0.4, 1.0)}, "horizons must be positive and increasing"),
         (ball_data(), {"substeps": 0}, "substeps must be a whole number"),
+        (ball_data(), {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         (ball_data(), {"huber": -1.0}, "huber must be a positive number"),
         (ball_data(), {"confidence": 95}, "confidence must lie between 0 and 1"),
         (ball_data(), {"horizons": 1.0}, "horizons must be positive and increasing"),
