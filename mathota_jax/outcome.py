@@ -19,6 +19,7 @@ from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.mechanism_layout import layout
 from mathota_jax.constraints.mechanism_links import Impulses, to_slots
 from mathota_jax.constraints.problem import Problem
+from mathota_jax.constraints.substep_rows import substep_length
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.settle import compute_once
@@ -101,9 +102,8 @@ def closing_force(model: Model, closed: Impulses) -> Array:
 
 def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tuple[Array, ...]) -> EndForces:
     """Mean forces over the last substep, from its impulses."""
-    scene = model.scene
-    time = model.dt / scene.options.substep_count
-    found = _mean_forces(scene, problem, impulses, time)
+    time = substep_length(model)
+    found = _mean_forces(model.scene, problem, impulses, time)
     return dataclasses.replace(before, time=jnp.broadcast_to(time, before.time.shape), **found)
 
 

@@ -17,7 +17,7 @@ from mathota_jax.spatial.settle import settle
 from mathota_jax.spatial.vector import Vec3, dot, normalize
 
 NEIGHBOURS = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))
-"""Grid points that share an edge with a grid point, as offsets (row, column)."""
+"""Grid points that share an edge with a grid point, as offsets (row, column); the last three opposite to the first."""
 
 
 def window_size(reach: float, cell_size: float) -> int:

@@ -28,7 +28,6 @@ from jax import Array, lax
 from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_tolerance, pick
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import (
-    NEIGHBOURS,
     Window,
     grid_window,
     ground_at,
@@ -213,8 +212,7 @@ def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window) -> Ca
 def _bends_down(ways: list[tuple[Vec3, np.ndarray]], cell: Array) -> Array:
     """Whether the ground (point, pair, world) is bent downwards at a point, along some line through it."""
     bends = jnp.zeros((), bool)
-    for k, (i, j) in enumerate(NEIGHBOURS):
-        (way, present), (back, behind) = ways[k], ways[NEIGHBOURS.index((-i, -j))]
+    for (way, present), (back, behind) in zip(ways[:3], ways[3:], strict=True):
         bends = bends | (present & behind & (lax.stop_gradient(way.y + back.y) < -FLAT * cell))
     return bends
 

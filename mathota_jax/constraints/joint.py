@@ -175,9 +175,9 @@ def _position_laws(
     slots = np.maximum(table.order, 0)
     laws = joints.laws[slots]
     one_sided = laws == STOP
-    free = np.where(np.isin(laws, CORRECTED) & ~np.isin(slots, left_out), np.inf, 0.0)
     # Others are void. Of bounds that leave nothing alone derivatives make a tie, at rest, and a share of a row.
-    works = (free > 0) | (one_sided & ~np.isin(slots, left_out))
+    works = np.isin(laws, CORRECTED) & ~np.isin(slots, left_out)
+    free = np.where(works, np.inf, 0.0)
     law = Bounded(
         effective_mass=jax.lax.stop_gradient(pack_scalars(table, [jnp.where(works[:, None], 1.0 / mass, 0.0)], worlds)),
         softness=_bounds(table, np.zeros(one_sided.shape)),

@@ -189,10 +189,10 @@ def starting_impulses(
         force = matched_force(model.scene, problem.contacts, problem.offsets, problem.close, state, last.contact_force)
     start = _impulses(model, problem, last.joint_force, force)
     if state.end_forces is not None:
-        longer = model.dt / model.scene.options.substep_count / state.end_forces.time
+        longer = substep_rows.substep_length(model) / state.end_forces.time
         share = lax.stop_gradient(jnp.minimum(LARGEST_GROWTH / longer, 1.0))
         return tuple(impulse * share for impulse in start), None
-    if problem.contacts is None or model.scene.options.solver == "soft_step":
+    if problem.contacts is None:
         return start, None
     return warm_start.plausible(problem.rows, inertia, velocity, start)
 

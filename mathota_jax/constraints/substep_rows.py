@@ -33,6 +33,11 @@ SHORTEST_PUSH = 1.0 / 960.0
 on one another, pressed in by what a step of 1/60 s lets them, parted at 7 m/s in a single step of 1e-5 s."""
 
 
+def substep_length(model: Model) -> Array:
+    """Time [s] of a small step."""
+    return model.dt / model.scene.options.substep_count
+
+
 def joint_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) -> tuple[Rows, Decoupling]:
     """Rows of one table whose laws are those of one substep, and how they were decoupled.
 
@@ -40,7 +45,7 @@ def joint_rows(scene: Scene, table: Table, model: Model, motion: JointMotion) ->
     """
     error = jnp.where((motion.start.laws == HOLD)[:, None], 0.0, motion.start.error)
     still = motion._replace(start=motion.start._replace(error=error), turning=None)
-    part = dataclasses.replace(model, dt=model.dt / scene.options.substep_count)
+    part = dataclasses.replace(model, dt=substep_length(model))
     return joint.decoupled_rows(scene, table, part, still)
 
 
@@ -103,8 +108,7 @@ def contact_error(scene: Scene, contact: ContactRows, model: Model) -> PositionE
 
 def _push_out_rate(model: Model) -> Array:
     """(world,) largest one [1/s] for the substep."""
-    substep = model.dt / model.scene.options.substep_count
-    return PUSH_OUT_RATE * jnp.minimum(substep / SHORTEST_PUSH, 1.0)
+    return PUSH_OUT_RATE * jnp.minimum(substep_length(model) / SHORTEST_PUSH, 1.0)
 
 
 def _smallest_radius(scene: Scene, rows: Rows, model: Model) -> Array:

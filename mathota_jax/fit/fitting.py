@@ -98,7 +98,7 @@ def fit(
     vector = parameter_vector(model, state, parameters)
     data.check_scene(model)
     _check_settings(
-        data, vector.initial, start, substeps, segments, horizons, huber, start_count, step_limit, confidence
+        data, vector.initial, start, substeps, segments, horizons, huber, start_count, seed, step_limit, confidence
     )
     if optimiser is not None:
         require_optax()
@@ -107,9 +107,7 @@ def fit(
     objective = Objective(model, state, vector, data, noise, segments, substeps, start, spread)
     if not objective.used:
         raise ValueError("fit: no recorded channel has a noise; nothing is compared")
-    if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:
-        raise ValueError(f"fit: seed must be a whole number of at least 0, got {seed!r}")
-    begin = vector.random_starts(start_count, int(seed))
+    begin = vector.random_starts(start_count, seed)
     return solve(objective, begin, horizons, huber, optimiser, step_limit, confidence, progress)
 
 
@@ -150,6 +148,7 @@ def _check_settings(
     horizons: Sequence[float],
     huber: float | None,
     start_count: int,
+    seed: int,
     step_limit: int,
     confidence: float,
 ) -> None:
@@ -157,14 +156,15 @@ def _check_settings(
         raise ValueError(f"fit: start must be one of {', '.join(map(repr, STARTS))}, got {start!r}")
     if initial and (start != "model" or segments != 1):
         raise ValueError('fit: parameters of the initial state need start="model" and segments=1')
-    for name, value in (
-        ("substeps", substeps),
-        ("segments", segments),
-        ("start_count", start_count),
-        ("step_limit", step_limit),
+    for name, value, least in (
+        ("substeps", substeps, 1),
+        ("segments", segments, 1),
+        ("start_count", start_count, 1),
+        ("seed", seed, 0),
+        ("step_limit", step_limit, 1),
     ):
-        if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"fit: {name} must be a whole number of at least 1, got {value!r}")
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+            raise ValueError(f"fit: {name} must be a whole number of at least {least}, got {value!r}")
     if segments > data.frame_count - 1:
         raise ValueError(
             f"fit: segments must be at most the {data.frame_count - 1} frames after the first, got {segments}"

@@ -3,13 +3,12 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Capsule, Plane, SceneBuilder, energy, step
+from mathota_jax import Box, Capsule, energy
 from tests.marks import slow_but
-from tests.scenes import DOWN, undamped
+from tests.scenes import body_on_plane, record_worlds, repeat, undamped
 
 WORLDS = 256
 SHAPES = {"pencil": Capsule(0.004, 0.08), "ruler": Box((0.15, 0.0015, 0.015)), "rod": Box((0.01, 0.15, 0.01))}
@@ -19,32 +18,20 @@ CASES = [f"{shape}-{way}" for shape in SHAPES for way in WAYS]
 
 def energies(shape, way, dt=1 / 60, seconds=2.0):
     """(step, world) of bodies dropped from 1 m in any orientation with some spin."""
-    builder = SceneBuilder(gravity=DOWN)
-    builder.add_body(Plane((0, 1, 0)), static=True, friction=0.5, restitution=0.3)
-    builder.add_body(SHAPES[shape], mass=0.01, position=(0, 1, 0), friction=0.5, restitution=0.3)
-    model, state = builder.build(undamped(dt=dt, **WAYS[way]))
+    model, state = body_on_plane(
+        SHAPES[shape], restitution=0.3, mass=0.01, position=(0, 1, 0), options=undamped(dt=dt, **WAYS[way])
+    )
     generator = np.random.default_rng(0)
     turn = generator.normal(size=(WORLDS, 4))
     spin = generator.normal(size=(WORLDS, 3)) * 5.0
-    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (WORLDS, *leaf.shape)), state)
+    models, states = repeat((model, state), WORLDS)
     states = dataclasses.replace(
         states,
         orientation=states.orientation.at[:, 1].set(turn / np.linalg.norm(turn, axis=1, keepdims=True)),
         angular_velocity=states.angular_velocity.at[:, 1].set(spin),
     )
-
-    def measure(states):
-        return jax.vmap(lambda state: energy(model, state))(states)
-
-    def advance(states, _):
-        states = jax.vmap(step, (None, 0))(model, states)
-        return states, measure(states)
-
-    def run(states):
-        return measure(states), jax.lax.scan(advance, states, None, length=round(seconds / dt))[1]
-
-    before, after = jax.jit(run)(states)
-    return np.concatenate([before[None], after])
+    _, after = record_worlds(models, states, round(seconds / dt), energy)
+    return np.concatenate([jax.vmap(energy)(models, states)[None], after])
 
 
 @pytest.mark.parametrize("case", slow_but(("pencil-pgs", "ruler-continuous"), CASES))
