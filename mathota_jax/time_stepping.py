@@ -60,9 +60,9 @@ def advance(
     Args:
       model: parameters and static scene.
       state: state of one world.
-      accumulator: () time left over by the last call [s]; 0 at the start.
-      elapsed: () time since the last call [s], at least 0. A negative or not finite one counts as 0 and sets
-        `Flag.INVALID_TIME_STEP`.
+      accumulator: () time left over by the last call [s], which rounding may have left a little below 0; 0 at the start.
+      elapsed: () time since the last call [s], at least 0. One of the two that is negative or not finite counts as 0 and
+        sets `Flag.INVALID_TIME_STEP`.
       action: (motor,) for all steps of this call, None for no effort.
       max_steps: largest number of steps, static. More time than they take is dropped and reported, since a program that
         is slower than its clock would fall behind more and more.
@@ -79,12 +79,14 @@ def advance(
         for name, value in (("accumulator", accumulator), ("elapsed", elapsed))
     )
     dt = model.dt
-    valid = (elapsed >= 0) & (elapsed < jnp.inf)
-    at_hand = accumulator + jnp.where(valid, elapsed, 0.0)
+    # What rounding left over may be a little less than nothing.
+    real, owed = (elapsed >= 0) & (elapsed < jnp.inf), (accumulator >= -dt) & (accumulator < jnp.inf)
+    valid = real & owed
+    at_hand = jnp.where(owed, accumulator, 0.0) + jnp.where(real, elapsed, 0.0)
     runs = (dt > 0) & (dt < jnp.inf)
     safe_dt = jnp.where(runs, dt, 1.0)
     share = ROUNDING * jnp.finfo(dt.dtype).eps
-    wanted = settle(jnp.where(runs, jnp.floor(at_hand / safe_dt * (1.0 + share) + share), 0.0))
+    wanted = settle(jnp.where(runs, jnp.floor(jnp.maximum(at_hand, 0.0) / safe_dt * (1.0 + share) + share), 0.0))
     taken = jnp.minimum(wanted, max_steps)
     dropped = (wanted - taken) * dt
     count = taken.astype(jnp.int32)

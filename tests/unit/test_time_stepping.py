@@ -47,6 +47,25 @@ def test_a_frame_of_one_step_is_one_step_however_it_rounds():
         assert int(found.step_count) == 1
 
 
+def test_a_pause_after_a_frame_that_fell_short_by_a_rounding_takes_no_step_back():
+    """The time left over is then a little less than nothing."""
+    model, state = with_dt(falling()[0], 1 / 60), falling()[1]
+    run = jax.jit(advance)
+    found = run(model, state, 0.0, jnp.nextafter(jnp.float32(51 / 60), jnp.float32(0)))
+    assert int(found.step_count) == 8 and float(found.accumulator) <= 0
+    paused = run(model, found.state, found.accumulator, 0.0)
+    assert int(paused.step_count) == 0 and float(paused.alpha) == 0 and int(paused.state.flags) == 0
+    assert float(paused.accumulator) == float(found.accumulator)
+
+
+@pytest.mark.parametrize("accumulator", [-0.5, np.nan, np.inf])
+def test_time_left_over_that_no_frame_leaves_is_flagged(accumulator):
+    model, state = falling()
+    found = jax.jit(advance)(model, state, accumulator, 1.5 * DT)
+    assert int(found.state.flags) == int(Flag.INVALID_TIME_STEP)
+    assert int(found.step_count) == 1 and float(found.accumulator) == pytest.approx(0.5 * DT)
+
+
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_a_frame_equals_its_steps(precision):
     model, state = slab_on_plane(velocity=(1.0, 0.0, 0.5), options=undamped(dt=DT))
