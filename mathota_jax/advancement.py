@@ -76,9 +76,16 @@ def first_contact(a: Mover, b: Mover, nearest: Callable[[Array], Nearest], durat
     """
     components = (*a.position, *a.velocity, *b.position, *b.velocity, duration)
     start = jnp.zeros(jnp.broadcast_shapes(*(jnp.shape(component) for component in components)), duration.dtype)
-    if "heightfield" in (a.geometry.kind, b.geometry.kind):
-        return _sample(a, b, nearest, start, duration, touching)
-    return _advance(a, b, nearest, start, duration, touching)
+    search = _sample if "heightfield" in (a.geometry.kind, b.geometry.kind) else _advance
+    found = search(a, b, nearest, start, duration, touching)
+    # Where a motion is not finite no comparison says anything.
+    known = jnp.isfinite(duration) | (duration > 0)
+    for mover in (a, b):
+        for component in (*mover.position, *mover.orientation, *mover.velocity, *mover.angular_velocity):
+            known = known & jnp.isfinite(component)
+    return found._replace(
+        time=jnp.where(known, found.time, jnp.nan), hit=found.hit & known, searched=found.searched & known
+    )
 
 
 class _Advance(NamedTuple):

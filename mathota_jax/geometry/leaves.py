@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -43,5 +44,6 @@ class Geometry:
         if not isinstance(shape, Shape):
             known = ", ".join(kind.__name__ for kind in SHAPES.values())
             raise ValueError(f"expected one of the shapes {known}, or a Geometry, got {shape!r}")
-        parameters = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in shape.parameters().items()}
+        with jax.ensure_compile_time_eval():  # known also inside of `jax.jit`
+            parameters = {name: jnp.asarray(x, jnp.result_type(float)) for name, x in shape.parameters().items()}
         return cls(parameters, shape.kind, shape.faces if isinstance(shape, Polyhedron) else None)

@@ -15,6 +15,7 @@ from mathota_jax import (
     Cone,
     Cylinder,
     Geometry,
+    Heightfield,
     Plane,
     Sphere,
     closest_points,
@@ -93,6 +94,16 @@ def test_every_pair_answers_with_finite_derivatives(float64, kind_a, kind_b):
     points = manifold(shape_a, pose_a, shape_b, pose_b)
     assert points.active[0]
     np.testing.assert_allclose(points.separation[points.active].min(), value, atol=1e-12)
+
+
+def test_shapes_made_inside_of_jit_are_known():
+    """How many cells of a heightfield a shape covers is decided by sizes that are not traced there."""
+
+    def gap(height):
+        pose = (jnp.array([0.1, 0.0, 0.2]).at[1].set(height), at(0, 0, 0)[1])
+        return signed_distance(Heightfield(np.zeros((5, 5)), 0.5), at(0, 0, 0), Sphere(0.15), pose).separation
+
+    np.testing.assert_allclose(jax.jit(gap)(0.4), 0.25, rtol=1e-6)
 
 
 def test_derivatives_by_sizes(float64):

@@ -151,6 +151,23 @@ def test_bad_motion():
         time_of_impact(Sphere(1), at(0, 0, 0), STILL, Sphere(1), at(3, 0, 0), (np.zeros(3),), 1.0)
 
 
+@pytest.mark.parametrize("shape", [Sphere(0.5), Box((0.5, 0.5, 0.5)), Heightfield(np.zeros((3, 3)), 1.0)])
+def test_what_is_not_finite_is_no_answer(shape):
+    """No hit, no time, and a word that nothing was found; the second motion is a real one."""
+    spin = np.zeros((5, 3))
+    velocity = np.array([[0, np.nan, 0], [0, -1.0, 0], [0, np.inf, 0], [np.inf, 0, 0], [0, np.nan, np.nan]])
+    spin[4] = np.nan
+
+    def search(velocity, spin):
+        return time_of_impact(shape, at(0, 0, 0), STILL, Box((0.5, 0.5, 0.5)), at(0, 3, 0), (velocity, spin), 10.0)
+
+    found = jax.jit(jax.vmap(search))(velocity, spin)
+    real = np.arange(5) == 1
+    np.testing.assert_array_equal(found.hit, real)
+    np.testing.assert_array_equal(found.distance.converged, real)
+    np.testing.assert_array_equal(np.isnan(found.time), ~real)
+
+
 def test_a_negative_duration():
     with pytest.raises(ValueError, match="duration must be at least 0 s"):
         time_of_impact(Sphere(1), at(0, 0, 0), STILL, Sphere(1), at(3, 0, 0), STILL, -1.0)
