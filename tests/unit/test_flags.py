@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Flag, step
+from mathota_jax import BallAndSocket, Flag, Hinge, SceneBuilder, Sphere, step
 from tests.scenes import advance_worlds, box_stack, repeat, sphere_on_plane
 
 WORLDS, BAD = 5, 2
@@ -70,7 +70,8 @@ def test_flag_stays_until_the_user_clears_it():
 
 
 @pytest.mark.parametrize(
-    ("leaf", "value"), [("friction", -0.1), ("friction", jnp.nan), ("restitution", 1.5), ("restitution", jnp.nan)]
+    ("leaf", "value"),
+    [("friction", -0.1), ("friction", jnp.nan), ("friction", jnp.inf), ("restitution", 1.5), ("restitution", jnp.nan)],
 )
 def test_surfaces_that_no_body_has_are_flagged(leaf, value):
     models, states = batch(lambda: sphere_on_plane(height=0.2, restitution=0.7, friction=0.5))
@@ -86,6 +87,40 @@ def test_sizes_that_no_shape_has_are_flagged(value):
     wrong = dataclasses.replace(models, shapes=models.shapes | {"box": {"half_extents": half}})
     flags = np.asarray(advance_worlds(wrong, states, 1).flags)
     np.testing.assert_array_equal(flags & int(Flag.INVALID_PARAMETER) != 0, np.arange(WORLDS) == BAD)
+
+
+RESISTANCES = ("joint_damping", "joint_friction", "joint_stiffness", "joint_armature")
+WRONG_OF_JOINTS = [
+    *((leaf, value) for leaf in RESISTANCES for value in (-0.1, jnp.nan, jnp.inf)),
+    ("joint_limits", (1.0, -1.0)),
+    ("joint_limits", (-1.0, jnp.nan)),
+    ("joint_swing", -0.1),
+    *((leaf, -1.0) for leaf in ("motor_limit", "motor_cap", "motor_stiffness", "motor_damping")),
+    ("size", -1.0),
+    ("size", jnp.inf),
+]
+
+
+def test_joints_that_nobody_builds_are_flagged():
+    """One world for each leaf that is out of range, and a last one with a stop that is no more, which is none."""
+    builder = SceneBuilder()
+    arms = [builder.add_body(Sphere(0.1), mass=1.0, position=(i, 0, 0)) for i in range(3)]
+    features = {"damping": 0.1, "friction": 0.1, "stiffness": 1.0, "armature": 0.1}
+    driven = builder.add_joint(Hinge(arms[0], arms[1], (0.5, 0, 0), (0, 0, 1), limits=(-1.0, 1.0), **features))
+    builder.add_joint(BallAndSocket(arms[1], arms[2], (1.5, 0, 0), axis=(1, 0, 0), swing=0.5, damping=0.1))
+    builder.add_motor(driven, kind="position", stiffness=1.0, damping=0.1, cap=1.0)
+    builder.add_body(Sphere(0.1), mass=1.0, position=(0, 9, 0))
+    model, state = builder.build()
+    worlds = [
+        dataclasses.replace(model, **{leaf: getattr(model, leaf).at[0].set(value)}) for leaf, value in WRONG_OF_JOINTS
+    ]
+    worlds.append(
+        dataclasses.replace(model, joint_limits=jnp.full_like(model.joint_limits, jnp.inf) * jnp.array([-1, 1]))
+    )
+    models = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
+    flags = np.asarray(advance_worlds(models, repeat(state, len(worlds)), 1, jnp.zeros((len(worlds), 1))).flags)
+    for case, flag in zip([*WRONG_OF_JOINTS, None], flags, strict=True):
+        assert bool(flag & Flag.INVALID_PARAMETER) == (case is not None), case
 
 
 def test_leaves_that_do_not_fit_are_named():
