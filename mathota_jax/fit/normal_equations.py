@@ -150,6 +150,12 @@ def solve(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.nd
     return step, -(inner + eliminated @ step)
 
 
+def foreseen_decrease(equations: NormalEquations) -> float:
+    """Of the cost, by a whole step of Gauss-Newton."""
+    step, start_step = solve(equations, 0.0)
+    return float(-0.5 * (equations.gradient @ step + np.sum(equations.start_gradient * start_step)))
+
+
 def information(equations: NormalEquations) -> np.ndarray:
     """What is known of the parameters (p, p) when the beginnings are unknown: the Schur complement."""
     if not equations.starts.shape[-1]:

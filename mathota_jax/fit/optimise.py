@@ -11,7 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from mathota_jax.fit.least_squares import Progress, Solution, Stage
+from mathota_jax.fit.normal_equations import foreseen_decrease, normal_equations, stack_starts
 from mathota_jax.fit.objective import Objective
+
+AWAY = 0.1
+"""Largest distance from a minimum, in standard deviations of the estimate, that counts as having reached it."""
 
 
 def require_optax() -> Any:
@@ -96,4 +100,19 @@ def optimise(
             if progress is not None:
                 progress(steps, limit, float(best_cost.min()))
         variables = best
-    return Solution(np.asarray(best[0], float), np.asarray(best[1], float), best_cost, np.isfinite(best_cost), steps)
+    found, charts = (np.asarray(part, float) for part in best)
+    settled = _settled(objective, found, charts, free, stages[-1], best_cost)
+    return Solution(found, charts, best_cost, settled, steps)
+
+
+def _settled(
+    objective: Objective, unbounded: np.ndarray, charts: np.ndarray, free: np.ndarray, stage: Stage, costs: np.ndarray
+) -> np.ndarray:
+    """(b,) whether each start ended near a minimum, as a step of Gauss-Newton from there tells."""
+    found = objective.linearise(unbounded, charts)
+    settled = np.isfinite(costs)
+    for b in map(int, np.flatnonzero(settled)):
+        part = stack_starts(found, b)
+        decrease = foreseen_decrease(normal_equations(part, stage.weights, free))
+        settled[b] = decrease <= 0.5 * AWAY**2 * costs[b] / (0.5 * np.sum(stage.weights.residual > 0))
+    return settled

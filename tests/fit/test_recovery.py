@@ -71,6 +71,34 @@ def test_restitution_over_several_bounces(drop_objective, start, gate):
     assert not result.warnings
 
 
+@pytest.mark.parametrize(("rate", "limit", "converged"), [(1e-4, 3, False), (0.05, 150, True)])
+def test_first_order_steps_tell_whether_they_have_arrived(rate, limit, converged, float64):
+    """A falling ball: three small steps leave gravity where it was, 150 larger ones find the least squares of it."""
+    optax = pytest.importorskip("optax")
+    builder = SceneBuilder(gravity=(0.0, -GRAVITY, 0.0))
+    builder.add_body(Sphere(RADIUS), mass=1.0, name="ball")
+    model, state = builder.build(undamped(dt=0.02))
+    times = np.arange(26) * 0.02
+    height = -0.5 * 9.0 * times**2 + np.random.default_rng(0).normal(size=26) * NOISE.position
+    position = np.zeros((1, 26, 1, 3))
+    position[0, :, 0, 1] = height
+    result = fit(
+        model,
+        state,
+        ["gravity"],
+        Trajectories("ball", 0.02, position),
+        start="model",
+        noise=Noise(position=NOISE.position),
+        optimiser=optax.adam(rate),
+        step_limit=limit,
+    )
+    best = -2.0 * np.sum(height * times**2) / np.sum(times**4)
+    low, high = result.interval("gravity")
+    assert result.converged == converged
+    assert any("Not converged" in warning for warning in result.warnings) == (not converged)
+    assert (abs(result["gravity"] - best) < 0.1 * (high - low)) == converged
+
+
 @pytest.mark.slow
 def test_restitution_beside_others(precision, gate):
     """The same in both precisions beside a contact at rest and a pair that never touches."""
