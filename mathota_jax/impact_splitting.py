@@ -101,9 +101,11 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     moved, displacement = advance(blocks, inertia, inertia, None, free, torque, decay, solved, lever, left, beyond)
     path = flight(blocks, inertia, free, torque, decay, solved, left)
     quiet = FirstImpact(left, jnp.zeros_like(split))
+    assert problem.contacts is not None
+    apart = jnp.broadcast_to(problem.contacts.separation, (scene.slot_count, left.shape[-1]))
     impact = lax.cond(
         split.any(),
-        lambda path: first_impact(whole, with_static(scene, bodies, path), gravity(whole), left, split),
+        lambda path: first_impact(whole, with_static(scene, bodies, path), apart, gravity(whole), left, split),
         lambda path: quiet,
         path,
     )

@@ -68,12 +68,15 @@ def tolerance(dtype: jnp.dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.5
 
 
-def first_impact(model: Model, flight: Flight, gravity: Vec3, left: Array, wanted: Array) -> FirstImpact:
+def first_impact(
+    model: Model, flight: Flight, separation: Array, gravity: Vec3, left: Array, wanted: Array
+) -> FirstImpact:
     """Time of the first impact within the time `left` (world,), in the worlds `wanted`.
 
     Args:
       model: parameters, `dt` being the whole time step, and static scene.
       flight: of all bodies.
+      separation: (slot, world) of the contacts at its start.
       gravity: components (1, world).
       left: time that is searched.
       wanted: (world,) bool; the others have no impact.
@@ -86,20 +89,23 @@ def first_impact(model: Model, flight: Flight, gravity: Vec3, left: Array, wante
     pull = norm(fixed_gravity)
     best = jnp.broadcast_to(end, wanted.shape)
     happens = jnp.zeros_like(wanted)
-    slots = []
+    slots, levels, first = [], [], 0
     for group in model.scene.pair_groups:
-        time, touches = _search(fixed_model, group, fixed, pull, end, wanted)
+        time, touches, level = _search(fixed_model, group, fixed, pull, end, wanted)
+        of_group = separation[first : first + group.slot_count]
+        levels.append(jnp.repeat(_level(level, of_group), group.point_count, axis=0))
+        first += group.slot_count
         best = jnp.minimum(best, jnp.where(touches, time, jnp.inf).min(0))
         happens = happens | touches.any(0)
         slots.append(jnp.repeat(jnp.where(touches, time, jnp.inf), group.point_count, axis=0))
-    time = _with_derivative(model, flight, end, best, happens, jnp.concatenate(slots))
+    time = _with_derivative(model, flight, end, best, happens, jnp.concatenate(slots), jnp.concatenate(levels))
     return FirstImpact(jnp.where(happens, time, left), happens)
 
 
 def _search(
     model: Model, group: PairGroup, flight: Flight, gravity: Array, end: Array, wanted: Array
-) -> tuple[Array, Array]:
-    """Time (pair, world) at which each pair of a group first meets, and whether it does."""
+) -> tuple[Array, Array, Array]:
+    """Time (pair, world) at which each pair of a group first meets, whether it does, and the gap that is taken to touch."""
     count = len(group.bodies_a)
     a, b = (take(flight, side) for side in (group.bodies_a, group.bodies_b))
     reach_a, reach_b = reaches(model, group)
@@ -111,8 +117,8 @@ def _search(
     shape = (count, wanted.shape[-1])
     end = jnp.broadcast_to(end, shape)
 
-    def look(time: Array, level: Array, first: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """At a time: level; step to the next touch; gap and rate of the deepest point; whether there is an impact."""
+    def look(time: Array, level: Array, first: Array) -> tuple[Array, ...]:
+        """At a time: level; step to the next touch; gap, rate and acceleration of the deepest point; an impact or not."""
         (one, _), (other, _) = a.at(time), b.at(time)
         found = contacts_between(model, group, one[:2], other[:2])
         spin_a, spin_b = norm(one.angular_velocity), norm(other.angular_velocity)
@@ -120,7 +126,7 @@ def _search(
         scale = norm(one.velocity) + norm(other.velocity) + turning(spin_a, reach_a) + turning(spin_b, reach_b)
         rests = rest_speed(gravity, model.dt, size, scale)
         step = jnp.full(shape, jnp.inf, size.dtype)
-        deepest, rate_there = step, jnp.zeros(shape, size.dtype)
+        deepest, rate_there, bend_there = step, jnp.zeros(shape, size.dtype), jnp.zeros(shape, size.dtype)
         impact = jnp.zeros(shape, bool)
         columns = [
             _by_point(component, count, shape) for component in (*found.position, *found.normal, found.separation)
@@ -142,11 +148,15 @@ def _search(
             step = jnp.minimum(step, jnp.where(counts, next_touch(gap, rate, bend, near)[0], jnp.inf))
             deeper = counts & (gap < deepest)
             deepest, rate_there = jnp.where(deeper, gap, deepest), jnp.where(deeper, rate, rate_there)
+            bend_there = jnp.where(deeper, bend, bend_there)
             impact = impact | (counts & (gap <= near) & (rate < 0))
-        return level, step, deepest, rate_there, impact
+        return level, step, deepest, rate_there, bend_there, impact
 
     def advance(state: _Search) -> _Search:
-        level, step, gap, rate, impact = look(state.time, state.level, state.count == 0)
+        level, step, gap, rate, bend, impact = look(state.time, state.level, state.count == 0)
+        # Bodies that overlapped and have parted since, as the speed of their return tells, meet at their surfaces.
+        parted = impact & (state.time > 0) & (rate * rate + 2.0 * jnp.minimum(bend, 0.0) * -level > 0)
+        gap, level = gap + jnp.where(parted, level, 0.0), jnp.where(parted, 0.0, level)
         inside = settle(jnp.where((gap < -near) & (state.time > 0), 1.0, 0.0)) > 0.5
         touches = settle(jnp.where(impact & ~inside, 1.0, 0.0)) > 0.5
         low = jnp.where(inside, state.low, state.time)
@@ -171,7 +181,18 @@ def _search(
     start = _Search(zero, zero, zero, zero + jnp.inf, wanted & (zero == 0), zero > 0, jnp.asarray(0))
     last = lax.while_loop(lambda s: s.going.any() & (s.count < ADVANCES), advance, start)
     # What is not decided by then is stopped where nothing was overstepped yet, and looked at again from there.
-    return jnp.where(last.going, last.low, last.time), last.touches | last.going
+    return jnp.where(last.going, last.low, last.time), last.touches | last.going, last.level
+
+
+def _level(level: Array, separation: Array) -> Array:
+    """The level (pair, world) of a search with the derivative of the overlap (slot, world) that it is."""
+    count, worlds = level.shape
+    apart = jnp.stack(_by_point(separation, count, (count, worlds)))
+    nearest = (
+        jnp.argmin(jnp.abs(lax.stop_gradient(apart) - level), 0)[None] == jnp.arange(apart.shape[0])[:, None, None]
+    )
+    overlap = jnp.where(nearest & (level < 0), apart, 0.0).sum(0)
+    return level + overlap - lax.stop_gradient(overlap)
 
 
 def _by_point(values: Array, count: int, shape: tuple[int, int]) -> list[Array]:
@@ -179,16 +200,18 @@ def _by_point(values: Array, count: int, shape: tuple[int, int]) -> list[Array]:
     return unstack(jnp.broadcast_to(values, (values.shape[0], shape[1])).reshape(count, -1, shape[1]), 1)
 
 
-def _with_derivative(model: Model, flight: Flight, end: Array, time: Array, happens: Array, meets: Array) -> Array:
+def _with_derivative(
+    model: Model, flight: Flight, end: Array, time: Array, happens: Array, meets: Array, level: Array
+) -> Array:
     """The time where something happens, refined by one step of Newton's method, which carries the derivative.
 
-    `meets` is the time of the pair of each slot.
+    `meets` and `level` are the time of the pair of each slot and the gap at which it touches.
     """
 
     def gaps(time: Array) -> tuple[Array, Array]:
         placed, _ = flight.at(time[None])
         found = find_contacts(model.scene, model.shapes, placed.position, placed.orientation)
-        return found.separation, found.active
+        return found.separation - level, found.active
 
     (gap, active), (rate, _) = jax.jvp(gaps, (time,), (jnp.ones_like(time),))
     rate = lax.stop_gradient(rate)
