@@ -27,7 +27,8 @@ their motion (`dynamics.events`), where a contact far ahead would stop them at t
 class ContactSet(NamedTuple):
     """All contact slots of a scene, components of shape (slot, world); slots are numbered group, pair, point.
 
-    `converged` is None if no pair of the scene needs an iterative search.
+    `converged` is None if no pair of the scene needs an iterative search. `apart` is whether the bodies do not meet in the
+    step unless something deflects them; None where nobody asked.
     """
 
     position: Vec3
@@ -36,6 +37,7 @@ class ContactSet(NamedTuple):
     feature: Array
     active: Array
     converged: Array | None
+    apart: Array | None = None
 
 
 def find_contacts(

@@ -28,7 +28,7 @@ from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
-from mathota_jax.constraints.swept import misses
+from mathota_jax.constraints.swept import misses, ways
 from mathota_jax.model import Model
 from mathota_jax.solver import pgs
 from mathota_jax.solver.laws import Cone
@@ -93,7 +93,7 @@ def foreseen(
     exact = (model, problem.contact_rows, now, then, left)
     fixed = lax.stop_gradient((model, problem.contact_rows, bodies, now, then, pull, left))
     model, groups, bodies, now, then, pull, left = fixed
-    past = misses(model, bodies, now, then, left).astype(now.dtype) if model.scene.slot_count else None
+    past = misses(model, ways(model.scene, bodies, now, then, left))
     for group, exact_group in zip(groups, exact[1], strict=True):
         rows = group.rows
         if isinstance(rows.table, TracedTable):
@@ -113,10 +113,11 @@ def foreseen(
         followed = ~reaches & (group.separation > TOUCHING * group.size)
         meets = settle(jnp.where(fast & reaches, 1.0, 0.0)) > 0.5
         followed = settle(jnp.where(followed, 1.0, 0.0)) > 0.5
-        flies_past = (pack_scalars(rows.table, [select(rows.table, past)], worlds) > 0.5) & (
-            group.separation > SPECULATIVE * group.size
-        )
-        clear = settle(jnp.where((fast & (start > 0) & (time > left)) | flies_past, 1.0, 0.0)) > 0.5
+        clear = fast & (start > 0) & (time > left)
+        if past is not None:
+            flies_past = pack_scalars(rows.table, [select(rows.table, past.astype(now.dtype))], worlds) > 0.5
+            clear = clear | (flies_past & (group.separation > SPECULATIVE * group.size))
+        clear = settle(jnp.where(clear, 1.0, 0.0)) > 0.5
         found.append(Foreseen(meets | followed, clear, *_leave(exact[0], exact_group, *exact[2:], fast)))
         bounces = bounces | (meets & (e > 0)).any((0, 1, 2))
     return tuple(found), bounces

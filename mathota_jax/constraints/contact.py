@@ -9,6 +9,7 @@ exact parabola and a bounce at tau is followed by the rest of the step in flight
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -170,20 +171,17 @@ def contact_rows(
     worlds = max(chosen.separation.shape[-1], motion.velocity.shape[-1], motion.free_velocity.shape[-1])
     normal = chosen.normal
     directions = (normal, *tangent_basis(normal)) if scene.friction else (normal,)
-    points = _points(scene, table, chosen, directions, motion, pairs, worlds)
+    points, beyond = _points(scene, table, chosen, directions, motion, pairs, worlds)
     # Points are less to read, which pays where sweeps go through lists; where pairs have turns of their own, sweeps have
     # fewer kernels with all entries. The other solvers need those.
     room = contact_places(scene)
     listed = pairs is not None or (room is not None and room.for_all)
     matrix = points.stored() if listed and scene.options.solver == "pgs" else points.dense()
-    # Stored for reverse mode: else their cotangents are computed again for each entry of the Jacobians.
     start, free = (
-        compute_once(along.reshape(-1, along.shape[-1]), chosen.separation)
-        for along in (
-            matrix_velocity(table, matrix.first_row(), places, velocity)
-            for velocity in (motion.velocity, motion.free_velocity)
-        )
+        _rates(table, matrix, places, velocity, chosen) for velocity in (motion.velocity, motion.free_velocity)
     )
+    unreached = _unreached(table, matrix, places, model.dt, chosen, motion, (start, free), beyond)
+    chosen = chosen._replace(separation=chosen.separation + unreached)
     restitution = pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
     if scene.options.solver == "soft_step":
@@ -248,6 +246,48 @@ def contact_rows(
     )
 
 
+def _unreached(
+    table: Table | TracedTable,
+    matrix: Any,
+    places: Places | None,
+    dt: Array,
+    contacts: ContactSet,
+    motion: Motion,
+    rates: tuple[Array, Array],
+    beyond: Array | None,
+) -> Array:
+    """How much of the way (column, world) that points seem to go along the normal within the step they will not go.
+
+    Points go straight on in the rows. In truth a body that spins in place comes no closer than it reaches, and those that
+    pass each other do not meet; if something else pushes them together, they still stop each other.
+    """
+    unreached = jnp.zeros(())
+    if beyond is not None:
+        turns = [
+            _rates(table, matrix, places, velocity.at[:3].set(0.0), contacts)
+            for velocity in (motion.velocity, motion.free_velocity)
+        ]
+        unreached = jnp.maximum(-dt * _lesser_mean(*turns) - beyond, 0.0)
+    if contacts.apart is not None:
+        way = lax.stop_gradient(dt * _lesser_mean(*rates))
+        unreached = jnp.where(contacts.apart & (contacts.separation + way < 0), jnp.maximum(unreached, -way), unreached)
+    return jnp.where(contacts.separation > 0, unreached, 0.0)
+
+
+def _lesser_mean(start: Array, free: Array) -> Array:
+    """The lesser of the rates at the start and in the mean of a step."""
+    return jnp.minimum(start, 0.5 * (start + free))
+
+
+def _rates(table: Table | TracedTable, matrix: Any, places: Places | None, velocity: Array, like: ContactSet) -> Array:
+    """Normal velocities (column, world).
+
+    Stored for reverse mode: else their cotangents are computed again for each entry of the Jacobians.
+    """
+    along = matrix_velocity(table, matrix.first_row(), places, velocity)
+    return compute_once(along.reshape(-1, along.shape[-1]), like.separation)
+
+
 def _first_grip(table: Table | TracedTable, approach: Approach, meets: Array, dt: Array) -> Array | None:
     """`first_grip` of the contacts whose points approach or part by no more than gravity does in a step."""
     slow = jnp.where(jnp.abs(approach.start) <= norm(approach.gravity) * dt, 1.0, 0.0).astype(meets.dtype)
@@ -271,13 +311,17 @@ def _points(
     motion: Motion,
     pairs: PlacedPairs | None,
     worlds: int,
-) -> Points:
-    """Jacobian and response of the contacts of one table; `contacts` are in its order."""
+) -> tuple[Points, Array | None]:
+    """Jacobian and response of the contacts of one table, which are in its order.
+
+    Also by how much each contact (column, world) comes closer if its bodies turn about their centres so that its points
+    lie farthest towards each other.
+    """
     places = None if pairs is None else pairs.places
     signs = _signs(scene, table, pairs)
     along = [direction * signs[0] for direction in directions] if len(signs) == 1 else directions
     packed = pack_directions(table, along, worlds)
-    angular, inertias = [], []
+    angular, inertias, beyond = [], [], []
     for side, sign in enumerate(signs):
         position, inertia = select_blocks(table, side, (motion.position, motion.inertia), places)
         entries = [_of_constraints(table, entry, worlds) for entry in jax.tree.leaves(inertia)]
@@ -288,7 +332,16 @@ def _points(
         surface = contacts.position + contacts.normal * (jnp.maximum(contacts.separation, 0.0) * (0.5 * sign))
         arm = compute_once(surface - position, contacts.separation)
         angular.append(turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds))
-    return Points(jnp.concatenate([packed, *angular], axis=2), tuple(inertias))
+        if not _lone_spheres(scene):
+            beyond.append(norm(arm) + dot(arm, contacts.normal) * sign)
+    points = Points(jnp.concatenate([packed, *angular], axis=2), tuple(inertias))
+    return points, functools.reduce(jnp.add, beyond) if beyond else None
+
+
+def _lone_spheres(scene: Scene) -> bool:
+    """Whether every moving body with shapes is one sphere, which comes no closer when it turns."""
+    shapes = [shape for shape in scene.shapes if not scene.static[shape.body]]
+    return len({shape.body for shape in shapes}) == len(shapes) and {shape.kind for shape in shapes} <= {"sphere"}
 
 
 def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> Array:

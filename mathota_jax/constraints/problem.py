@@ -29,6 +29,7 @@ from mathota_jax.constraints import (
 from mathota_jax.constraints.contact_force import warm_start_impulse
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.slots import contact_offsets, matched_force, own_contacts
+from mathota_jax.constraints.swept import misses, ways
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.soft_laws import PositionError
@@ -151,6 +152,8 @@ def constrain(
             found = [contact.near_contacts(scene, model, own) for own in found]
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
         then = contact.pack_motion(scene, *free)
+        way = ways(scene, bodies, now, then, model.dt)
+        found = [own._replace(apart=misses(model, way)) for own in found]
         inverse = compute_once(inertia.inverse(), state.position)
         motion = contact.Motion(blocks.position, now, then, inverse, gravity)
         contact_rows = [
@@ -158,11 +161,11 @@ def constrain(
         ]
         if scene.broadphase is not None:
             close = compact.close_pairs(model, bodies, free)
-            sets, more = compact.contacts_and_rows(model, bodies, close, motion)
+            sets, more = compact.contacts_and_rows(model, bodies, close, motion, way)
             found, contact_rows = found + sets, contact_rows + more
         if held is not None and scene.rebounds_may_gain:
             contact_rows = rebound_limit.with_held_falling(held, contact_rows, gravity)
-        contacts = join_contacts(found)
+        contacts = join_contacts([one._replace(apart=None) for one in found])
         offsets = contact_offsets(model, bodies, contacts, close)
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)

@@ -2,52 +2,76 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, of_all_bodies
 from mathota_jax.collision.placement import shape_parameters
 from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.model import Model
-from mathota_jax.scene import PairGroup
+from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.vector import Vec3, dot, norm
 
 
-def misses(model: Model, bodies: Bodies, now: Array, then: Array, left: Array) -> Array:
-    """(slot, world) whether the bounding spheres of a pair of bodies stay apart; of contacts that have slots of their own.
+class Way(NamedTuple):
+    """What bodies may do in some time if nothing stops them; components (body, world) [m].
 
-    Under a constant acceleration a path keeps within ``|a| t^2 / 8`` of its chord.
+    Attributes:
+      start: centres of mass.
+      path: displacement.
+      bend: by how much the way may depart from its chord: under a constant acceleration by ``|a| t^2 / 8``.
+    """
+
+    start: Vec3
+    path: Vec3
+    bend: Vec3
+
+
+def ways(scene: Scene, bodies: Bodies, now: Array, then: Array, left: Array) -> Way:
+    """Of all bodies, without derivative.
 
     Args:
-      model: parameters and static scene.
+      scene: static structure.
       bodies: all of them.
       now, then: (component, block, world) velocities now and after the time `left` without constraints.
       left: (1, world) time [s].
     """
-    scene = model.scene
+    bodies, now, then, left = lax.stop_gradient((bodies, now, then, left))
     mean, change = (Vec3(*unstack(part[:3], 0)) for part in (0.5 * (now + then), then - now))
     path, bend = of_all_bodies(scene, mean * left), of_all_bodies(scene, change * (0.125 * left))
-    found = []
-    for group in scene.pair_groups:
-        (from_a, path_a, bend_a), (from_b, path_b, bend_b) = (
-            take((bodies.position, path, bend), side) for side in (group.bodies_a, group.bodies_b)
-        )
-        start, way = from_b - from_a, path_b - path_a
-        share = jnp.clip(safe_divide(-dot(start, way), dot(way, way)), 0.0, 1.0)
-        distance = norm(start + way * share) - norm(bend_b - bend_a)
-        apart = distance > _reach(model, group)
-        found.append(jnp.repeat(apart, group.point_count, axis=0))
+    return Way(bodies.position, path, bend)
+
+
+def stay_apart(a: Way, b: Way, reach: Array) -> Array:
+    """Whether bodies that reach so far from their centres of mass, together, do not meet, however they turn."""
+    start, path = b.start - a.start, b.path - a.path
+    share = jnp.clip(safe_divide(-dot(start, path), dot(path, path)), 0.0, 1.0)
+    return norm(start + path * share) - norm(b.bend - a.bend) > reach
+
+
+def misses(model: Model, way: Way) -> Array | None:
+    """(slot, world) which pairs of bodies with slots of their own stay apart; None where all are with planes."""
+    worlds, found = way.path.x.shape[-1], []
+    if all("plane" in (group.kind_a, group.kind_b) for group in model.scene.pair_groups):
+        return None
+    for group in model.scene.pair_groups:
+        if "plane" in (group.kind_a, group.kind_b):
+            found.append(jnp.zeros((group.slot_count, worlds), bool))
+            continue
+        a, b = (take(way, side) for side in (group.bodies_a, group.bodies_b))
+        reach = shape_reach(model, group.kind_a, group.shapes_a) + shape_reach(model, group.kind_b, group.shapes_b)
+        found.append(jnp.repeat(stay_apart(a, b, reach), group.point_count, axis=0))
     return jnp.concatenate(found)
 
 
-def _reach(model: Model, group: PairGroup) -> Array:
-    """(pair or 1, world) sum of the radii about the centres of mass that hold the shapes of a pair."""
-    total = jnp.zeros((1, 1), model.size.dtype)
-    for kind, rows in ((group.kind_a, group.shapes_a), (group.kind_b, group.shapes_b)):
-        total = total + bounding_radius(kind, shape_parameters(model.scene, model.shapes, kind, rows))
-        local = model.shapes[kind].get("local_position")
-        if local is not None:
-            total = total + norm(Vec3(*unstack(take(local, rows), 1)))
-    return total
+def shape_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
+    """(row, world or 1) radii of the spheres about the centres of mass that hold the shapes, without derivative."""
+    shapes = lax.stop_gradient(model.shapes)
+    reach = bounding_radius(kind, shape_parameters(model.scene, shapes, kind, rows))
+    local = shapes[kind].get("local_position")
+    return reach if local is None else reach + norm(Vec3(*unstack(take(local, rows), 1)))

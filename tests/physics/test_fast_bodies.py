@@ -25,7 +25,7 @@ from mathota_jax import (
     step,
 )
 from tests.benchmarks import hard_scenes
-from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64
+from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64, slow_but
 from tests.scenes import (
     advance,
     body_on_plane,
@@ -153,6 +153,29 @@ def test_a_spinning_stick_does_not_fall_through_the_ground():
     states = shots(state, 100.0, np.random.default_rng(3).uniform(-50, 50, RUNS))
     states = dataclasses.replace(states, position=states.position.at[:, 1, 0].add(-2.0))
     assert not escapes(model, states, steps=40).any()
+
+
+@pytest.mark.parametrize("way", slow_but(("pgs", "listed"), ("pgs", "soft_step", "converged", "listed")))
+def test_what_flies_past_touches_nothing(way, gate):
+    """Balls that pass a post and each other at up to 200 m/s, by as little as a hundredth of their radius."""
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    radius = 0.1
+    for _ in range(2):
+        builder.add_body(Sphere(radius), mass=1.0, friction=0.5)
+    builder.add_body(Sphere(radius), static=True, friction=0.5, position=(0, 0, 0))
+    model, state = builder.build(
+        undamped(dt=DT, **({"broadphase": "all_pairs"} if way == "listed" else {"solver": way}))
+    )
+    rng = np.random.default_rng(8)
+    angle, clearance = rng.uniform(0, 2 * np.pi, RUNS), radius * (2.0 + 10 ** rng.uniform(-2, 1, RUNS))
+    beside = np.stack([np.zeros(RUNS), np.cos(angle), np.sin(angle)], axis=-1) * clearance[:, None]
+    place, velocity = np.zeros((2, RUNS, 3, 3))
+    place[:, 0], place[:, 1] = beside, -beside
+    place[:, :2, 0] = rng.uniform(-3, 3, (RUNS, 2))
+    velocity[:, :2, 0] = -np.sign(place[:, :2, 0]) * 10 ** rng.uniform(0.5, 2.3, (RUNS, 2))
+    states = dataclasses.replace(repeat(state, RUNS), position=jnp.asarray(place), velocity=jnp.asarray(velocity))
+    final, _ = record_worlds(repeat(model, RUNS), states, 20, motion)
+    gate("change of velocity [m/s]", np.asarray(final.velocity) - velocity, 1e-5)
 
 
 @pytest.mark.slow
