@@ -187,15 +187,19 @@ class Scene:
         return self.static_slot_count + sum(group.slot_count for group in self.compact_groups)
 
     @functools.cached_property
+    def jointed(self) -> frozenset[int]:
+        """Bodies that have joints."""
+        return frozenset(body for joint in self.joints for body in (joint.parent, joint.child))
+
+    @functools.cached_property
     def rebounds_may_gain(self) -> bool:
         """Whether anything bounces whose rebound may take more energy than the impact had.
 
         Not one free ball on something static, or on another: the impulse of its contact changes no other rate of it.
         """
         several = bool(self.compact_groups) or sum(len(group.bodies_a) for group in self.pair_groups) > 1
-        jointed = {body for joint in self.joints for body in (joint.parent, joint.child)}
         free_balls = all(
-            self.static[body] or (kind == "sphere" and body not in jointed)
+            self.static[body] or (kind == "sphere" and body not in self.jointed)
             for group in self.pair_groups
             for bodies, kind in ((group.bodies_a, group.kind_a), (group.bodies_b, group.kind_b))
             for body in bodies

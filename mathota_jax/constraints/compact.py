@@ -146,14 +146,18 @@ def _narrow_phase(
 
 
 def _ways_of_shapes(model: Model, way: Way) -> tuple[Way, Array]:
-    """Ways of the bodies of all shapes that take part in the broadphase (shape, world), and how far the shapes reach."""
+    """Ways of the bodies of all shapes that take part in the broadphase (shape, world), and how far the shapes reach.
+
+    Those of jointed bodies may reach anything (`swept`).
+    """
     scene = model.scene
     assert scene.broadphase is not None
     reaches = []
     for kind, places in kind_ranges(scene):
-        rows = [scene.shapes[scene.broadphase.shapes[place]].index for place in places]
-        reach = jnp.ones((1, 1)) if kind == "plane" else shape_reach(model, kind, rows)
-        reaches.append(jnp.broadcast_to(reach, (len(places), way.path.x.shape[-1])))
+        entries = [scene.shapes[scene.broadphase.shapes[place]] for place in places]
+        reach = jnp.ones((1, 1)) if kind == "plane" else shape_reach(model, kind, [entry.index for entry in entries])
+        jointed = np.asarray([[entry.body in scene.jointed] for entry in entries])
+        reaches.append(jnp.broadcast_to(jnp.where(jointed, jnp.inf, reach), (len(places), way.path.x.shape[-1])))
     return take(way, admissible_pairs(scene).bodies), jnp.concatenate(reaches)
 
 

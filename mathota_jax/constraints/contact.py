@@ -39,6 +39,7 @@ from mathota_jax.constraints.effective_mass import (
 )
 from mathota_jax.constraints.impact import Approach, impact, loaded, rebound
 from mathota_jax.constraints.mechanism_layout import contact_places
+from mathota_jax.constraints.unreached import Turns, lone_spheres, unreached
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Cone, Push
@@ -180,8 +181,14 @@ def contact_rows(
     start, free = (
         _rates(table, matrix, places, velocity, chosen) for velocity in (motion.velocity, motion.free_velocity)
     )
-    unreached = _unreached(table, matrix, places, model.dt, chosen, motion, (start, free), beyond)
-    chosen = chosen._replace(separation=chosen.separation + unreached)
+    turns = None
+    if beyond is not None:
+        spins, free_spins = (velocity.at[:3].set(0.0) for velocity in (motion.velocity, motion.free_velocity))
+        turns = Turns(
+            _rates(table, matrix, places, spins, chosen), _rates(table, matrix, places, free_spins, chosen), beyond
+        )
+    room = chosen.separation + unreached(chosen.separation, start, free, turns, chosen.apart, model.dt)
+    chosen = chosen._replace(separation=room)
     restitution = pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
     if scene.options.solver == "soft_step":
@@ -246,39 +253,6 @@ def contact_rows(
     )
 
 
-def _unreached(
-    table: Table | TracedTable,
-    matrix: Any,
-    places: Places | None,
-    dt: Array,
-    contacts: ContactSet,
-    motion: Motion,
-    rates: tuple[Array, Array],
-    beyond: Array | None,
-) -> Array:
-    """How much of the way (column, world) that points seem to go along the normal within the step they will not go.
-
-    Points go straight on in the rows. In truth a body that spins in place comes no closer than it reaches, and those that
-    pass each other do not meet; if something else pushes them together, they still stop each other.
-    """
-    unreached = jnp.zeros(())
-    if beyond is not None:
-        turns = [
-            _rates(table, matrix, places, velocity.at[:3].set(0.0), contacts)
-            for velocity in (motion.velocity, motion.free_velocity)
-        ]
-        unreached = jnp.maximum(-dt * _lesser_mean(*turns) - beyond, 0.0)
-    if contacts.apart is not None:
-        way = lax.stop_gradient(dt * _lesser_mean(*rates))
-        unreached = jnp.where(contacts.apart & (contacts.separation + way < 0), jnp.maximum(unreached, -way), unreached)
-    return jnp.where(contacts.separation > 0, unreached, 0.0)
-
-
-def _lesser_mean(start: Array, free: Array) -> Array:
-    """The lesser of the rates at the start and in the mean of a step."""
-    return jnp.minimum(start, 0.5 * (start + free))
-
-
 def _rates(table: Table | TracedTable, matrix: Any, places: Places | None, velocity: Array, like: ContactSet) -> Array:
     """Normal velocities (column, world).
 
@@ -332,16 +306,10 @@ def _points(
         surface = contacts.position + contacts.normal * (jnp.maximum(contacts.separation, 0.0) * (0.5 * sign))
         arm = compute_once(surface - position, contacts.separation)
         angular.append(turn_of_points(table, packed, arm if side == len(signs) - 1 else -arm, worlds))
-        if not _lone_spheres(scene):
+        if not lone_spheres(scene):
             beyond.append(norm(arm) + dot(arm, contacts.normal) * sign)
     points = Points(jnp.concatenate([packed, *angular], axis=2), tuple(inertias))
     return points, functools.reduce(jnp.add, beyond) if beyond else None
-
-
-def _lone_spheres(scene: Scene) -> bool:
-    """Whether every moving body with shapes is one sphere, which comes no closer when it turns."""
-    shapes = [shape for shape in scene.shapes if not scene.static[shape.body]]
-    return len({shape.body for shape in shapes}) == len(shapes) and {shape.kind for shape in shapes} <= {"sphere"}
 
 
 def _of_constraints(table: Table | TracedTable, values: Array, worlds: int) -> Array:

@@ -29,7 +29,7 @@ from mathota_jax.constraints import (
 from mathota_jax.constraints.contact_force import warm_start_impulse
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.slots import contact_offsets, matched_force, own_contacts
-from mathota_jax.constraints.swept import misses, ways
+from mathota_jax.constraints.swept import free_pairs, misses, ways
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.soft_laws import PositionError
@@ -153,7 +153,8 @@ def constrain(
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
         then = contact.pack_motion(scene, *free)
         way = ways(scene, bodies, now, then, model.dt)
-        found = [own._replace(apart=misses(model, way)) for own in found]
+        if (apart := misses(model, way)) is not None:
+            found = [own._replace(apart=apart & free_pairs(scene)) for own in found]
         inverse = compute_once(inertia.inverse(), state.position)
         motion = contact.Motion(blocks.position, now, then, inverse, gravity)
         contact_rows = [

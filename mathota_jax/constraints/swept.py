@@ -1,4 +1,7 @@
-"""Which bodies fly past each other: the spheres about them do not meet on their way."""
+"""Which bodies fly past each other: the spheres about them do not meet on their way.
+
+What joints make of the way is not known beforehand: rows of contacts of jointed bodies rely on none.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, of_all_bodies
@@ -67,6 +71,11 @@ def misses(model: Model, way: Way) -> Array | None:
         reach = shape_reach(model, group.kind_a, group.shapes_a) + shape_reach(model, group.kind_b, group.shapes_b)
         found.append(jnp.repeat(stay_apart(a, b, reach), group.point_count, axis=0))
     return jnp.concatenate(found)
+
+
+def free_pairs(scene: Scene) -> np.ndarray:
+    """(slot, 1) which pairs of bodies with slots of their own have no joints."""
+    return np.asarray([[scene.jointed.isdisjoint(pair)] for pair in zip(*scene.slot_bodies, strict=True)])
 
 
 def shape_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
