@@ -297,8 +297,9 @@ def _implementation(*args: Array, native: Native, world_axes: int) -> list[Array
 def _batching_rule(
     primitive: Primitive, args: Sequence[Array], axes: Sequence[int | None], *, world_axes: int, **params: Any
 ) -> tuple[list[Array], list[int]]:
+    # Constants inside of loops come as numbers of Python.
     moved = [
-        jnp.expand_dims(arg, arg.ndim) if axis is None else jnp.moveaxis(arg, axis, -1)
+        jnp.expand_dims(arg, jnp.ndim(arg)) if axis is None else jnp.moveaxis(arg, axis, -1)
         for arg, axis in zip(args, axes, strict=True)
     ]
     outputs = primitive.bind(*moved, world_axes=world_axes + 1, **params)

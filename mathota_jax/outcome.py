@@ -104,7 +104,7 @@ def end_forces(model: Model, problem: Problem, before: EndForces, impulses: tupl
     """Mean forces over the last substep, from its impulses."""
     time = substep_length(model)
     found = _mean_forces(model.scene, problem, impulses, time)
-    return dataclasses.replace(before, time=jnp.broadcast_to(time, before.time.shape), **found)
+    return dataclasses.replace(before, time=time + jnp.zeros_like(before.time), **found)
 
 
 def _mean_forces(scene: Scene, problem: Problem, impulses: tuple[Array, ...], time: Array) -> dict[str, Array]:

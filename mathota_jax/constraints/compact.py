@@ -15,19 +15,18 @@ import numpy as np
 from jax import Array
 
 from mathota_jax.bodies import Bodies, of_all_bodies
-from mathota_jax.collision.bounds import admissible_pairs, kind_ranges, swept_bounds
+from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.compact import compact_contacts
 from mathota_jax.collision.narrowphase import ContactSet, stored
 from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
-from mathota_jax.constraints.swept import Way, shape_reach, stay_apart
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours
 from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.chunks import map_filled
-from mathota_jax.spatial.indexing import gather, gather_together, take
+from mathota_jax.spatial.indexing import gather, take
 from mathota_jax.spatial.running_sum import running_sum
 from mathota_jax.spatial.vector import Vec3, norm
 
@@ -94,19 +93,19 @@ def _turns_matter(scene: Scene, model: Model) -> bool:
     return kinds - {"plane"} != {"sphere"} or "local_position" in model.shapes["sphere"]
 
 
-def contacts_of(model: Model, bodies: Bodies, close: ClosePairs, way: Way | None = None) -> list[ContactSet]:
-    """Runs the narrow phase for the close pairs, a set for each compact group; which stay apart it tells on a way alone."""
+def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:
+    """Runs the narrow phase for the close pairs, a set for each compact group."""
     scene = model.scene
     assert scene.broadphase is not None
     sets = []
     for group, places in zip(scene.compact_groups, close.groups, strict=True):
-        contacts, pairs = _narrow_phase(model, group, bodies, way), (places.pair, places.active)
+        contacts, pairs = _narrow_phase(model, group, bodies), (places.pair, places.active)
         sets.append(map_filled(contacts, pairs, filled(places)) if scene.broadphase.one_by_one else contacts(pairs))
     return sets
 
 
 def contacts_and_rows(
-    model: Model, bodies: Bodies, close: ClosePairs, motion: Motion, way: Way
+    model: Model, bodies: Bodies, close: ClosePairs, motion: Motion
 ) -> tuple[list[ContactSet], list[ContactRows]]:
     """`contacts_of`, and the rows of the contacts."""
     scene = model.scene
@@ -115,11 +114,11 @@ def contacts_and_rows(
         both = []
         for group, places in zip(scene.compact_groups, close.groups, strict=True):
             (table, placed), *_ = places.tables
-            found = _narrow_phase(model, group, bodies, way)
+            found = _narrow_phase(model, group, bodies)
             both.append(rows_one_by_one(scene, table, model, found, (places.pair, places.active), motion, placed))
         sets, rows = zip(*both, strict=True)
         return list(sets), list(rows)
-    sets, rows = contacts_of(model, bodies, close, way), []
+    sets, rows = contacts_of(model, bodies, close), []
     for places, contacts in zip(close.groups, sets, strict=True):
         first = places.tables[0][0].first_slot
         for table, placed in places.tables:
@@ -129,36 +128,11 @@ def contacts_and_rows(
     return sets, rows
 
 
-def _narrow_phase(
-    model: Model, group: CompactGroup, bodies: Bodies, way: Way | None
-) -> Callable[[tuple[tuple[Array, Array], Array]], ContactSet]:
-    scene = model.scene
-    shapes = None if way is None or "plane" in (group.kind_a, group.kind_b) else _ways_of_shapes(model, way)
-
-    def contacts(pairs: tuple[tuple[Array, Array], Array]) -> ContactSet:
-        found = compact_contacts(scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
-        if shapes is None:
-            return found
-        (a, reach_a), (b, reach_b) = (gather_together(shapes, side) for side in pairs[0])
-        return found._replace(apart=jnp.repeat(stay_apart(a, b, reach_a + reach_b), group.point_count, axis=0))
+def _narrow_phase(model: Model, group: CompactGroup, bodies: Bodies) -> Callable[[tuple], ContactSet]:
+    def contacts(pairs: tuple) -> ContactSet:
+        return compact_contacts(model.scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
 
     return contacts
-
-
-def _ways_of_shapes(model: Model, way: Way) -> tuple[Way, Array]:
-    """Ways of the bodies of all shapes that take part in the broadphase (shape, world), and how far the shapes reach.
-
-    Those of jointed bodies may reach anything (`swept`).
-    """
-    scene = model.scene
-    assert scene.broadphase is not None
-    reaches = []
-    for kind, places in kind_ranges(scene):
-        entries = [scene.shapes[scene.broadphase.shapes[place]] for place in places]
-        reach = jnp.ones((1, 1)) if kind == "plane" else shape_reach(model, kind, [entry.index for entry in entries])
-        jointed = np.asarray([[entry.body in scene.jointed] for entry in entries])
-        reaches.append(jnp.broadcast_to(jnp.where(jointed, jnp.inf, reach), (len(places), way.path.x.shape[-1])))
-    return take(way, admissible_pairs(scene).bodies), jnp.concatenate(reaches)
 
 
 def pair_key(scene: Scene, first: Array, second: Array) -> Array:

@@ -29,7 +29,7 @@ from mathota_jax.constraints import (
 from mathota_jax.constraints.contact_force import warm_start_impulse
 from mathota_jax.constraints.decoupling import Decoupling
 from mathota_jax.constraints.slots import contact_offsets, matched_force, own_contacts
-from mathota_jax.constraints.swept import free_pairs, misses, ways
+from mathota_jax.constraints.swept import largest_turn, undisturbed, ways
 from mathota_jax.model import Model
 from mathota_jax.solver.rows import Rows
 from mathota_jax.solver.soft_laws import PositionError
@@ -152,9 +152,9 @@ def constrain(
             found = [contact.near_contacts(scene, model, own) for own in found]
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
         then = contact.pack_motion(scene, *free)
-        way = ways(scene, bodies, now, then, model.dt)
-        if (apart := misses(model, way)) is not None:
-            found = [own._replace(apart=apart & free_pairs(scene)) for own in found]
+        if scene.pair_groups:
+            way, turn = ways(scene, bodies, now, then, model.dt), largest_turn(scene, bodies, free[1], model.dt)
+            found = [own._replace(apart=undisturbed(model, way, turn, own)) for own in found]
         inverse = compute_once(inertia.inverse(), state.position)
         motion = contact.Motion(blocks.position, now, then, inverse, gravity)
         contact_rows = [
@@ -162,7 +162,7 @@ def constrain(
         ]
         if scene.broadphase is not None:
             close = compact.close_pairs(model, bodies, free)
-            sets, more = compact.contacts_and_rows(model, bodies, close, motion, way)
+            sets, more = compact.contacts_and_rows(model, bodies, close, motion)
             found, contact_rows = found + sets, contact_rows + more
         if held is not None and scene.rebounds_may_gain:
             contact_rows = rebound_limit.with_held_falling(held, contact_rows, gravity)

@@ -1,6 +1,6 @@
 """Which bodies fly past each other: the spheres about them do not meet on their way.
 
-What joints make of the way is not known beforehand: rows of contacts of jointed bodies rely on none.
+What joints make of the way is not known beforehand, and what other contacts make of it only within bounds.
 """
 
 from __future__ import annotations
@@ -13,13 +13,18 @@ import numpy as np
 from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, of_all_bodies
+from mathota_jax.collision.narrowphase import ContactSet
 from mathota_jax.collision.placement import shape_parameters
 from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.model import Model
-from mathota_jax.scene import Scene
+from mathota_jax.scene import PairGroup, Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.vector import Vec3, dot, norm
+
+DEFLECTION = 3.0
+"""Largest change of a body's velocity by a contact over the approach that it ends: twice that of a rebound from something
+far heavier, and what friction adds."""
 
 
 class Way(NamedTuple):
@@ -51,6 +56,11 @@ def ways(scene: Scene, bodies: Bodies, now: Array, then: Array, left: Array) -> 
     return Way(bodies.position, path, bend)
 
 
+def largest_turn(scene: Scene, bodies: Bodies, free: Vec3, time: Array) -> Array:
+    """(body, world) angle [rad] by which bodies turn at most; `free` are spins of the moving ones without constraints."""
+    return jnp.maximum(norm(bodies.angular_velocity), norm(of_all_bodies(scene, free))) * time
+
+
 def stay_apart(a: Way, b: Way, reach: Array) -> Array:
     """Whether bodies that reach so far from their centres of mass, together, do not meet, however they turn."""
     start, path = b.start - a.start, b.path - a.path
@@ -60,22 +70,95 @@ def stay_apart(a: Way, b: Way, reach: Array) -> Array:
 
 def misses(model: Model, way: Way) -> Array | None:
     """(slot, world) which pairs of bodies with slots of their own stay apart; None where all are with planes."""
-    worlds, found = way.path.x.shape[-1], []
-    if all("plane" in (group.kind_a, group.kind_b) for group in model.scene.pair_groups):
+    if not _may_miss(model.scene):
         return None
-    for group in model.scene.pair_groups:
-        if "plane" in (group.kind_a, group.kind_b):
-            found.append(jnp.zeros((group.slot_count, worlds), bool))
-            continue
-        a, b = (take(way, side) for side in (group.bodies_a, group.bodies_b))
-        reach = shape_reach(model, group.kind_a, group.shapes_a) + shape_reach(model, group.kind_b, group.shapes_b)
-        found.append(jnp.repeat(stay_apart(a, b, reach), group.point_count, axis=0))
-    return jnp.concatenate(found)
+    return _by_slot(model.scene, [_stays_apart(model, group, way, None) for group in model.scene.pair_groups])
 
 
-def free_pairs(scene: Scene) -> np.ndarray:
-    """(slot, 1) which pairs of bodies with slots of their own have no joints."""
-    return np.asarray([[scene.jointed.isdisjoint(pair)] for pair in zip(*scene.slot_bodies, strict=True)])
+def undisturbed(model: Model, way: Way, turn: Array, contacts: ContactSet) -> Array | None:
+    """The same, whatever other contacts make of the ways: those that may act within the step deflect bodies.
+
+    Args:
+      model: parameters and static scene.
+      way: what bodies do if nothing stops them.
+      turn: (body, world) angle [rad] by which they turn at most.
+      contacts: those with slots of their own.
+    """
+    scene = model.scene
+    if not _may_miss(scene):
+        return None
+    contacts, turn = lax.stop_gradient((contacts, turn))
+    strikes, first = [], 0
+    for group in scene.pair_groups:
+        found = take(contacts._replace(converged=None), range(first, first + group.slot_count))
+        strikes.append(_strikes(model, group, way, turn, found))
+        first += group.slot_count
+    deflection = DEFLECTION * _sum_by_body(scene, jnp.concatenate(strikes))
+    apart = _by_slot(scene, [_stays_apart(model, group, way, deflection) for group in scene.pair_groups])
+    return apart & np.asarray([[scene.jointed.isdisjoint(pair)] for pair in zip(*scene.slot_bodies, strict=True)])
+
+
+def _strikes(model: Model, group: PairGroup, way: Way, turn: Array, contacts: ContactSet) -> Array:
+    """(pair, world) way [m] of the bodies of a group towards each other that their contact may end; 0 if it can not act."""
+    pairs, worlds = len(group.bodies_a), way.path.x.shape[-1]
+
+    def by_point(values: Array) -> Array:
+        return jnp.broadcast_to(values, (group.slot_count, worlds)).reshape(pairs, -1, worlds)
+
+    def by_pair(values: Array) -> Array:
+        return jnp.broadcast_to(values, (pairs, worlds))[:, None]
+
+    middle, normal = contacts.position.map(by_point), contacts.normal.map(by_point)
+    separation, active = by_point(contacts.separation), by_point(contacts.active)
+    (a, turn_a), (b, turn_b) = (take((way, turn), side) for side in (group.bodies_a, group.bodies_b))
+    approach = by_pair(norm(b.bend - a.bend)) - dot((b.path - a.path).map(by_pair), normal)
+    for kind, rows, of_body, angle, sign in (
+        (group.kind_a, group.shapes_a, a, turn_a, 1.0),
+        (group.kind_b, group.shapes_b, b, turn_b, -1.0),
+    ):
+        extent = sign * dot(middle - of_body.start.map(by_pair), normal) - 0.5 * separation
+        closer = jnp.maximum(by_pair(shape_reach(model, kind, rows)) - extent, 0.0)
+        arc = by_pair(angle * _turning_reach(model, kind, rows))
+        approach = approach + jnp.where(by_pair(angle) > 0, jnp.minimum(arc, closer), 0.0)
+    approach = jnp.maximum(approach, 0.0)
+    may_act = active & (separation <= approach) & ~_stays_apart(model, group, way, None)[:, None]
+    return jnp.where(may_act, approach + jnp.maximum(-separation, 0.0), 0.0).max(1)
+
+
+def _sum_by_body(scene: Scene, values: Array) -> Array:
+    """(body, world) sums of values of pairs (pair, world) over the pairs of each moving body; 0 for static ones."""
+    pairs_of: list[list[int]] = [[] for _ in scene.static]
+    pairs = [pair for group in scene.pair_groups for pair in zip(group.bodies_a, group.bodies_b, strict=True)]
+    for number, pair in enumerate(pairs):
+        for body in pair:
+            if not scene.static[body]:
+                pairs_of[body].append(number)
+    most = max(map(len, pairs_of))
+    padded = [(found + [len(pairs)] * most)[:most] for found in pairs_of]
+    with_none = jnp.concatenate([values, jnp.zeros_like(values[:1])])
+    return take(with_none, np.asarray(padded).ravel()).reshape(len(padded), most, -1).sum(1)
+
+
+def _may_miss(scene: Scene) -> bool:
+    return not all("plane" in (group.kind_a, group.kind_b) for group in scene.pair_groups)
+
+
+def _by_slot(scene: Scene, apart: list[Array]) -> Array:
+    return jnp.concatenate(
+        [jnp.repeat(pairs, group.point_count, axis=0) for pairs, group in zip(apart, scene.pair_groups, strict=True)]
+    )
+
+
+def _stays_apart(model: Model, group: PairGroup, way: Way, deflection: Array | None) -> Array:
+    """(pair, world) `stay_apart` of a group, though each body may be deflected (body, world) [m]; nothing misses a plane."""
+    shape = (len(group.bodies_a), way.path.x.shape[-1])
+    if "plane" in (group.kind_a, group.kind_b):
+        return jnp.zeros(shape, bool)
+    a, b = (take(way, side) for side in (group.bodies_a, group.bodies_b))
+    reach = shape_reach(model, group.kind_a, group.shapes_a) + shape_reach(model, group.kind_b, group.shapes_b)
+    if deflection is not None:
+        reach = reach + take(deflection, group.bodies_a) + take(deflection, group.bodies_b)
+    return jnp.broadcast_to(stay_apart(a, b, reach), shape)
 
 
 def shape_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
@@ -84,3 +167,11 @@ def shape_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
     reach = bounding_radius(kind, shape_parameters(model.scene, shapes, kind, rows))
     local = shapes[kind].get("local_position")
     return reach if local is None else reach + norm(Vec3(*unstack(take(local, rows), 1)))
+
+
+def _turning_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
+    """As `shape_reach`, of what turning moves: a sphere about its centre of mass turns in itself."""
+    reach = shape_reach(model, kind, rows)
+    if kind != "sphere":
+        return reach
+    return reach - bounding_radius(kind, shape_parameters(model.scene, lax.stop_gradient(model.shapes), kind, rows))

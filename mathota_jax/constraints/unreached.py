@@ -42,7 +42,10 @@ def unreached(
     """
     way = jnp.zeros(())
     if turns is not None:
-        way = jnp.maximum(-dt * _lesser_mean(turns.start, turns.free) - turns.most, 0.0)
+        # What turning may bring within reach is held off as if it were: seen a step later it would lie deep.
+        shift = dt * jnp.minimum(_lesser_mean(start - turns.start, free - turns.free), 0.0)
+        turn = -dt * _lesser_mean(turns.start, turns.free)
+        way = jnp.where(separation + shift > turns.most, jnp.maximum(turn - turns.most, 0.0), 0.0)
     if apart is not None:
         # Nothing moves by it: it has no derivative.
         whole = lax.stop_gradient(-dt * _lesser_mean(start, free))

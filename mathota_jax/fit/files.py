@@ -57,7 +57,7 @@ def load_npz(path: str | Path) -> Trajectories:
     try:
         with np.load(path, allow_pickle=False) as archive:
             content = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile, AttributeError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
         raise ValueError(f"{path}: not an NPZ file of plain arrays ({error})") from error
     needed, known = ("dt", "bodies", "position"), ("dt", "bodies", *CHANNELS, "action")
     for key in needed:

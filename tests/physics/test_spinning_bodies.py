@@ -20,7 +20,6 @@ WAYS = {
     "soft_step": {"solver": "soft_step"},
     "converged": {"solver": "converged"},
     "split": {"impact_events": 2},
-    "listed": {"broadphase": "all_pairs"},
 }
 CASES = [f"{shape}-{way}" for shape in SHAPES for way in WAYS]
 
