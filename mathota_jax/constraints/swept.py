@@ -135,8 +135,8 @@ def _sum_by_body(scene: Scene, values: Array) -> Array:
                 pairs_of[body].append(number)
     most = max(map(len, pairs_of))
     padded = [(found + [len(pairs)] * most)[:most] for found in pairs_of]
-    with_none = jnp.concatenate([values, jnp.zeros_like(values[:1])])
-    return take(with_none, np.asarray(padded).ravel()).reshape(len(padded), most, -1).sum(1)
+    of_pairs = take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), np.ravel(padded))
+    return jnp.broadcast_to(of_pairs, (len(padded) * most, values.shape[-1])).reshape(len(padded), most, -1).sum(1)
 
 
 def _may_miss(scene: Scene) -> bool:

@@ -198,9 +198,10 @@ def test_bad_files(tmp_path):
     with pytest.raises(ValueError, match=r"motion\.csv: not a text file in UTF-8"):
         load(path)
     path = tmp_path / "motion.npz"
-    path.write_bytes(b"no archive")
-    with pytest.raises(ValueError, match="not an NPZ file"):
-        load(path)
+    for content in (b"no archive", b""):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"motion\.npz: not an NPZ file"):
+            load(path)
     np.savez(path, dt=0.1, position=np.zeros((4, 1, 3)))
     with pytest.raises(ValueError, match="the key 'bodies' is missing"):
         load(path)

@@ -190,7 +190,7 @@ def test_a_ball_that_leaves_out_of_an_overlap(float64, gate):
     )
     gate("height and velocity", found[0] - truth[0], 1e-12)
     for name, by, exactly in zip(("overlap", "speed", "time step"), found[1], truth[1], strict=True):
-        gate(f"by the {name}", by - exactly, 1e-8)
+        gate(f"by the {name} / largest", (by - exactly) / np.abs(exactly).max(), 1e-7)
 
 
 def test_without_restitution_the_option_changes_nothing(float64):

@@ -10,7 +10,7 @@ import pytest
 
 from mathota_jax import Hinge, Plane, SceneBuilder, Sphere, contacts, rollout, step
 from tests.marks import slow_but
-from tests.scenes import stack, undamped
+from tests.scenes import sphere_on_plane, stack, undamped
 
 WORLDS, STEPS = 3, 3
 
@@ -212,6 +212,36 @@ def test_one_mapped_leaf_of_the_model(float64):
         step(dataclasses.replace(base, friction=f), s, a) for f, s, a in zip(frictions, states, actions, strict=True)
     ]
     assert_states_equal(measured, stack(truth))
+
+
+@pytest.mark.parametrize("solver", ["pgs", "soft_step"])
+def test_a_time_step_of_each_world_from_one_state(solver):
+    """What the state remembers of the last step has one world there, and what the step made of it has as many as steps."""
+    model, state = sphere_on_plane(height=0.05, options=undamped(solver=solver))
+    steps = jnp.asarray([1 / 240, 1 / 60, 1 / 30])
+
+    def fallen(dt, state=state):
+        return step(dataclasses.replace(model, dt=dt), step(dataclasses.replace(model, dt=dt), state))
+
+    mapped = jax.jit(jax.vmap(fallen))(steps)
+    for world, dt in enumerate(steps):
+        alone = jax.jit(fallen)(dt)
+        np.testing.assert_allclose(mapped.position[world], alone.position, atol=1e-6)
+        np.testing.assert_allclose(mapped.velocity[world], alone.velocity, atol=1e-6)
+
+
+def test_a_number_as_time_step_inside_of_a_loop():
+    """JAX hands constants of loops to the rule of a map as numbers, not as arrays."""
+    model, state = sphere_on_plane(height=0.05, options=undamped())
+    states = jax.tree.map(lambda leaf: jnp.stack([leaf] * WORLDS), state)
+
+    def looped(state):
+        return jax.lax.fori_loop(0, 2, lambda _, now: step(dataclasses.replace(model, dt=0.01), now), state)
+
+    expected = step(dataclasses.replace(model, dt=jnp.float32(0.01)), state)
+    expected = step(dataclasses.replace(model, dt=jnp.float32(0.01)), expected)
+    found = jax.jit(jax.vmap(looped))(states)
+    np.testing.assert_allclose(found.position[0], expected.position, atol=1e-6)
 
 
 def test_worlds_along_another_axis(float64):
