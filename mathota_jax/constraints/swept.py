@@ -5,6 +5,7 @@ What joints make of the way is not known beforehand, and what other contacts mak
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -136,7 +137,9 @@ def _sum_by_body(scene: Scene, values: Array) -> Array:
     most = max(map(len, pairs_of))
     padded = [(found + [len(pairs)] * most)[:most] for found in pairs_of]
     of_pairs = take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), np.ravel(padded))
-    return jnp.broadcast_to(of_pairs, (len(padded) * most, values.shape[-1])).reshape(len(padded), most, -1).sum(1)
+    of_pairs = jnp.broadcast_to(of_pairs, (len(padded) * most, values.shape[-1])).reshape(len(padded), most, -1)
+    # A sum by the library is a loop of its own (`tests/compile`).
+    return functools.reduce(jnp.add, unstack(of_pairs, 1))
 
 
 def _may_miss(scene: Scene) -> bool:
