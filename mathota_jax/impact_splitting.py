@@ -102,10 +102,10 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     path = flight(blocks, inertia, free, torque, decay, solved, left)
     quiet = FirstImpact(left, jnp.zeros_like(split))
     assert problem.contacts is not None
-    apart = jnp.broadcast_to(problem.contacts.separation, (scene.slot_count, left.shape[-1]))
+    gaps = problem.contacts.separation
     impact = lax.cond(
         split.any(),
-        lambda path: first_impact(whole, with_static(scene, bodies, path), apart, gravity(whole), left, split),
+        lambda path: first_impact(whole, with_static(scene, bodies, path), gaps, gravity(whole), left, split),
         lambda path: quiet,
         path,
     )

@@ -28,7 +28,7 @@ class ContactSet(NamedTuple):
     """All contact slots of a scene, components of shape (slot, world); slots are numbered group, pair, point.
 
     `converged` is None if no pair of the scene needs an iterative search. `apart` is whether the bodies do not meet in the
-    step unless something deflects them; None where nobody asked.
+    step, whatever deflects them; None where nobody asked.
     """
 
     position: Vec3

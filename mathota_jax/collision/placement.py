@@ -8,13 +8,14 @@ from typing import Any
 import jax.numpy as jnp
 from jax import Array
 
+from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.geometry.hull import padded_faces
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, multiply, to_matrix
 from mathota_jax.spatial.settle import compute_once
-from mathota_jax.spatial.vector import Vec3
+from mathota_jax.spatial.vector import Vec3, norm
 
 UNROTATED_KINDS = ("plane", "sphere")
 """Kinds whose contacts do not depend on the orientation of the body (planes are given in the world frame)."""
@@ -43,6 +44,20 @@ def shape_parameters(
         else:
             found[name] = Vec3(*unstack(values, 1)) if values.ndim == 3 else values
     return found
+
+
+def shape_reach(
+    scene: Scene, shapes: dict[str, dict[str, Array]], kind: str, rows: Sequence[int]
+) -> tuple[Array, Array]:
+    """(row or 1, world) how far shapes reach from the centres of mass of their bodies: in all, and what turning moves.
+
+    A sphere about its centre of mass turns in itself.
+    """
+    radius = bounding_radius(kind, shape_parameters(scene, shapes, kind, rows))
+    local = shapes[kind].get("local_position")
+    offset = jnp.zeros((1, 1), radius.dtype) if local is None else norm(Vec3(*unstack(take(local, rows), 1)))
+    whole = radius + offset
+    return whole, offset if kind == "sphere" else whole
 
 
 def shape_poses(

@@ -187,8 +187,8 @@ def contact_rows(
         turns = Turns(
             _rates(table, matrix, places, spins, chosen), _rates(table, matrix, places, free_spins, chosen), beyond
         )
-    room = chosen.separation + unreached(chosen.separation, start, free, turns, chosen.apart, model.dt)
-    chosen = chosen._replace(separation=room)
+    further = unreached(chosen.separation, start, free, turns, chosen.apart, model.dt)
+    chosen = chosen._replace(separation=chosen.separation + further)
     restitution = pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
     if scene.options.solver == "soft_step":

@@ -152,21 +152,21 @@ def constrain(
             found = [contact.near_contacts(scene, model, own) for own in found]
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
         then = contact.pack_motion(scene, *free)
-        if scene.pair_groups:
-            way, turn = ways(scene, bodies, now, then, model.dt), largest_turn(scene, bodies, free[1], model.dt)
-            found = [own._replace(apart=undisturbed(model, way, turn, own)) for own in found]
         inverse = compute_once(inertia.inverse(), state.position)
         motion = contact.Motion(blocks.position, now, then, inverse, gravity)
-        contact_rows = [
-            contact.contact_rows(scene, table, model, found[0], motion) for table in contact.contact_tables(scene)
-        ]
+        if scene.pair_groups:
+            way, turn = ways(scene, bodies, now, then, model.dt), largest_turn(scene, bodies, free[1], model.dt)
+            own = found[0]._replace(apart=undisturbed(model, way, turn, found[0]))
+            contact_rows = [
+                contact.contact_rows(scene, table, model, own, motion) for table in contact.contact_tables(scene)
+            ]
         if scene.broadphase is not None:
             close = compact.close_pairs(model, bodies, free)
             sets, more = compact.contacts_and_rows(model, bodies, close, motion)
             found, contact_rows = found + sets, contact_rows + more
         if held is not None and scene.rebounds_may_gain:
             contact_rows = rebound_limit.with_held_falling(held, contact_rows, gravity)
-        contacts = join_contacts([one._replace(apart=None) for one in found])
+        contacts = join_contacts(found)
         offsets = contact_offsets(model, bodies, contacts, close)
     if small_steps:
         errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)

@@ -5,7 +5,6 @@ What joints make of the way is not known beforehand, and what other contacts mak
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,12 +14,12 @@ from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, of_all_bodies
 from mathota_jax.collision.narrowphase import ContactSet
-from mathota_jax.collision.placement import shape_parameters
-from mathota_jax.geometry.bounds import bounding_radius
+from mathota_jax.collision.placement import shape_reach
 from mathota_jax.model import Model
 from mathota_jax.scene import PairGroup, Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.spread import add_slices
 from mathota_jax.spatial.vector import Vec3, dot, norm
 
 DEFLECTION = 3.0
@@ -118,8 +117,8 @@ def _strikes(model: Model, group: PairGroup, way: Way, turn: Array, contacts: Co
         (group.kind_b, group.shapes_b, b, turn_b, -1.0),
     ):
         extent = sign * dot(middle - of_body.start.map(by_pair), normal) - 0.5 * separation
-        closer = jnp.maximum(by_pair(shape_reach(model, kind, rows)) - extent, 0.0)
-        arc = by_pair(angle * _turning_reach(model, kind, rows))
+        reach, swung = _reach(model, kind, rows)
+        closer, arc = jnp.maximum(by_pair(reach) - extent, 0.0), by_pair(angle * swung)
         approach = approach + jnp.where(by_pair(angle) > 0, jnp.minimum(arc, closer), 0.0)
     approach = jnp.maximum(approach, 0.0)
     may_act = active & (separation <= approach) & ~_stays_apart(model, group, way, None)[:, None]
@@ -138,8 +137,7 @@ def _sum_by_body(scene: Scene, values: Array) -> Array:
     padded = [(found + [len(pairs)] * most)[:most] for found in pairs_of]
     of_pairs = take(jnp.concatenate([values, jnp.zeros_like(values[:1])]), np.ravel(padded))
     of_pairs = jnp.broadcast_to(of_pairs, (len(padded) * most, values.shape[-1])).reshape(len(padded), most, -1)
-    # A sum by the library is a loop of its own (`tests/compile`).
-    return functools.reduce(jnp.add, unstack(of_pairs, 1))
+    return add_slices(of_pairs, 1)
 
 
 def _may_miss(scene: Scene) -> bool:
@@ -158,23 +156,12 @@ def _stays_apart(model: Model, group: PairGroup, way: Way, deflection: Array | N
     if "plane" in (group.kind_a, group.kind_b):
         return jnp.zeros(shape, bool)
     a, b = (take(way, side) for side in (group.bodies_a, group.bodies_b))
-    reach = shape_reach(model, group.kind_a, group.shapes_a) + shape_reach(model, group.kind_b, group.shapes_b)
+    reach = _reach(model, group.kind_a, group.shapes_a)[0] + _reach(model, group.kind_b, group.shapes_b)[0]
     if deflection is not None:
         reach = reach + take(deflection, group.bodies_a) + take(deflection, group.bodies_b)
     return jnp.broadcast_to(stay_apart(a, b, reach), shape)
 
 
-def shape_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
-    """(row, world or 1) radii of the spheres about the centres of mass that hold the shapes, without derivative."""
-    shapes = lax.stop_gradient(model.shapes)
-    reach = bounding_radius(kind, shape_parameters(model.scene, shapes, kind, rows))
-    local = shapes[kind].get("local_position")
-    return reach if local is None else reach + norm(Vec3(*unstack(take(local, rows), 1)))
-
-
-def _turning_reach(model: Model, kind: str, rows: Sequence[int]) -> Array:
-    """As `shape_reach`, of what turning moves: a sphere about its centre of mass turns in itself."""
-    reach = shape_reach(model, kind, rows)
-    if kind != "sphere":
-        return reach
-    return reach - bounding_radius(kind, shape_parameters(model.scene, lax.stop_gradient(model.shapes), kind, rows))
+def _reach(model: Model, kind: str, rows: Sequence[int]) -> tuple[Array, Array]:
+    """`shape_reach` without derivative."""
+    return shape_reach(model.scene, lax.stop_gradient(model.shapes), kind, rows)

@@ -6,13 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from mathota_jax.collision.narrowphase import ContactSet, group_contacts
-from mathota_jax.collision.placement import shape_parameters
-from mathota_jax.geometry.bounds import bounding_radius
+from mathota_jax.collision.placement import shape_reach
 from mathota_jax.model import Model
 from mathota_jax.scene import PairGroup
-from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.quaternion import Quaternion
-from mathota_jax.spatial.vector import Vec3, norm
+from mathota_jax.spatial.vector import Vec3
 
 Placed = tuple[Vec3, Quaternion]
 
@@ -32,14 +30,9 @@ def contacts_between(model: Model, group: PairGroup, a: Placed, b: Placed) -> Co
 
 def reaches(model: Model, group: PairGroup) -> tuple[Array, Array]:
     """(pair or 1, world) how far the shapes A and B reach from the centres of mass, as far as turning moves them."""
-    found = []
-    for kind, rows in ((group.kind_a, group.shapes_a), (group.kind_b, group.shapes_b)):
-        radius = bounding_radius(kind, shape_parameters(model.scene, model.shapes, kind, rows))
-        local = model.shapes[kind].get("local_position")
-        offset = jnp.zeros((1, 1), model.size.dtype) if local is None else norm(Vec3(*unstack(take(local, rows), 1)))
-        # A sphere about its centre of mass turns in itself.
-        found.append(offset if kind == "sphere" else radius + offset)
-    return found[0], found[1]
+    sides = ((group.kind_a, group.shapes_a), (group.kind_b, group.shapes_b))
+    of_a, of_b = (shape_reach(model.scene, model.shapes, kind, rows)[1] for kind, rows in sides)
+    return of_a, of_b
 
 
 def turning(turn: Array, reach: Array) -> Array:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mathota_jax.fit.normal_equations import Weights, cost, normal_equations, solve, stack_starts
+from mathota_jax.fit.normal_equations import Weights, cost, foreseen_decrease, normal_equations, solve, stack_starts
 from mathota_jax.fit.objective import Objective
 
 FIRST_DAMPING = 1e-3
@@ -87,8 +87,7 @@ def levenberg_marquardt(
             for b in np.flatnonzero(~converged & ~stuck):
                 equations = normal_equations(parts[b], weights, free)
                 change, chart_change = solve(equations, damping[b])
-                slope = equations.gradient @ change + np.sum(equations.start_gradient * chart_change)
-                foreseen[b] = -0.5 * slope
+                foreseen[b] = foreseen_decrease(equations, change, chart_change)
                 trial[b] += change
                 trial_charts[b].reshape(len(chart_change), -1)[:, free] += chart_change
             found = objective.linearise(trial, trial_charts)

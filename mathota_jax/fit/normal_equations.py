@@ -150,9 +150,8 @@ def solve(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.nd
     return step, -(inner + eliminated @ step)
 
 
-def foreseen_decrease(equations: NormalEquations) -> float:
-    """Of the cost, by a whole step of Gauss-Newton."""
-    step, start_step = solve(equations, 0.0)
+def foreseen_decrease(equations: NormalEquations, step: np.ndarray, start_step: np.ndarray) -> float:
+    """Of the cost, by a step that `solve` gives."""
     return float(-0.5 * (equations.gradient @ step + np.sum(equations.start_gradient * start_step)))
 
 

@@ -159,8 +159,7 @@ def cut(model: Model, state: State, data: Trajectories, segment_count: int, star
     pull = np.zeros((data.count, segment_count, len(model.scene.dynamic_bodies), len(motions), 3))
     if start == "free":
         widths = np.array([getattr(spread, leaf) for leaf in Motion._fields])
-        jointed = {body for joint in model.scene.joints for body in (joint.parent, joint.child)}
-        loose = [body not in jointed for body in model.scene.dynamic_bodies]
+        loose = [body not in model.scene.jointed for body in model.scene.dynamic_bodies]
         unknown = ~told[:, 0, list(model.scene.dynamic_bodies)] & np.array(loose, bool)[:, None]
         pull[:, 0] = np.where(unknown, 1.0 / widths, 0.0)[..., None]
     return Segments(motions, observed, action, pull.reshape(data.count, segment_count, -1), frames)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mathota_jax.fit.least_squares import Progress, Solution, Stage
-from mathota_jax.fit.normal_equations import foreseen_decrease, normal_equations, stack_starts
+from mathota_jax.fit.normal_equations import foreseen_decrease, normal_equations, solve, stack_starts
 from mathota_jax.fit.objective import Objective
 
 AWAY = 0.1
@@ -113,6 +113,8 @@ def _settled(
     settled = np.isfinite(costs)
     for b in map(int, np.flatnonzero(settled)):
         part = stack_starts(found, b)
-        decrease = foreseen_decrease(normal_equations(part, stage.weights, free))
-        settled[b] = decrease <= 0.5 * AWAY**2 * costs[b] / (0.5 * np.sum(stage.weights.residual > 0))
+        equations = normal_equations(part, stage.weights, free)
+        # A step by one deviation changes the cost by half the mean square of the residuals.
+        allowed = AWAY**2 * costs[b] / np.sum(stage.weights.residual > 0)
+        settled[b] = foreseen_decrease(equations, *solve(equations, 0.0)) <= allowed
     return settled
