@@ -6,7 +6,9 @@ large grids. Grid arrays have the shape ``(row, column, pair, world)``, lists ``
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -18,6 +20,10 @@ from mathota_jax.spatial.vector import Vec3, dot, normalize
 
 NEIGHBOURS = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))
 """Grid points that share an edge with a grid point, as offsets (row, column); the last three opposite to the first."""
+
+
+DOWN = 4.0
+"""By how many sizes of the body upright edges end below its centre."""
 
 
 def window_size(reach: float, cell_size: float) -> int:
@@ -57,7 +63,8 @@ class Triangles(NamedTuple):
 class Edges(NamedTuple):
     """Edges with the normals on either side, such that ``cross(minus, plus)`` runs along convex ones.
 
-    Beyond the border of the grid the ground drops vertically. `exists` is False where the window, not the grid, ends.
+    Beyond the border of the grid the ground drops vertically. `exists` is False where the window, not the grid, ends;
+    `upright` (edge, 1, 1) are those below the four corners.
     """
 
     start: Vec3
@@ -66,6 +73,7 @@ class Edges(NamedTuple):
     plus: Vec3
     exists: Array
     number: Array
+    upright: np.ndarray
 
 
 def gather_heights(heights: Array, row: Array, column: Array) -> Array:
@@ -128,8 +136,8 @@ def triangles(window: Window) -> Triangles:
     )
 
 
-def edges(window: Window) -> Edges:
-    """All edges of a window: along rows, along columns, diagonal."""
+def edges(window: Window, size: Array) -> Edges:
+    """All edges of a window: along rows, along columns, diagonal, upright, for bodies of that size [m]."""
     p, lower, upper = window.points, window.lower, window.upper
     rows, columns = window.field["heights"].shape[:2]
     down, right = lower.x.shape[:2]
@@ -179,6 +187,8 @@ def edges(window: Window) -> Edges:
         ),
     ]
 
+    groups.append(_upright_edges(window, size, (first_row, last_row), (first_column, last_column)))
+
     def joined(values: list[Any]) -> Vec3:
         return Vec3(*(jnp.concatenate([listed(v) for v in components]) for components in zip(*values, strict=True)))
 
@@ -186,17 +196,36 @@ def edges(window: Window) -> Edges:
     exists = [listed(jnp.broadcast_to(g[4], (*g[0].x.shape[:2], *g[4].shape[2:]))) for g in groups]
     shape = jnp.broadcast_shapes(*(e.shape[1:] for e in exists))
     exists = jnp.concatenate([jnp.broadcast_to(e, (e.shape[0], *shape)) for e in exists])
-    numbers = jnp.concatenate([3 * group[5] + k for k, group in enumerate(groups)])
+    numbers = jnp.concatenate([4 * group[5] + k for k, group in enumerate(groups)])
     start, span, minus, plus = vectors
-    return Edges(start, span, minus, plus, exists, numbers)
+    upright = np.arange(len(numbers)).reshape(-1, 1, 1) >= len(numbers) - 4
+    return Edges(start, span, minus, plus, exists, numbers, upright)
 
 
-def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Array]:
+def _upright_edges(window: Window, size: Array, at_rows: tuple[Any, Any], at_columns: tuple[Any, Any]) -> tuple:
+    """The edges below the corners of the window, those of the grid, as `edges` lists them: (2, 2, pair, world)."""
+    start = window.points.map(lambda c: c[:: len(c) - 1, :: c.shape[1] - 1])
+    zero = jnp.zeros_like(start.x)
+    # Down to below the body, whose centre is the origin.
+    span = Vec3(zero, -jnp.maximum(start.y, 0.0) - DOWN * size, zero)
+    out = np.asarray([-1.0, 1.0])
+    at_x = Vec3(zero + out.reshape(2, 1, 1, 1), zero, zero)
+    at_z = Vec3(zero, zero, zero + out.reshape(1, 2, 1, 1))
+    # Seen from above the walls follow each other as -x, -z, +x, +z.
+    x_first = np.asarray([[True, False], [False, True]]).reshape(2, 2, 1, 1)
+    minus = Vec3(*(jnp.where(x_first, a, b) for a, b in zip(at_x, at_z, strict=True)))
+    plus = Vec3(*(jnp.where(x_first, b, a) for a, b in zip(at_x, at_z, strict=True)))
+    exists = jnp.stack([jnp.stack([row & column for column in at_columns]) for row in at_rows])
+    numbers = _point_numbers(window, None, None).reshape(*window.points.x.shape[:2], *window.row.shape)
+    return start, span, minus, plus, exists, listed(numbers[:: len(numbers) - 1, :: numbers.shape[1] - 1])
+
+
+def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Array, Array]:
     """What decides whether a direction looks out of the ground at a grid point.
 
     Returns:
         For each of `NEIGHBOURS` the way there (point, pair, world) and whether it is in the window (point, 1, 1);
-        whether the point is known with all its neighbours; its number.
+        whether the point is known with all its neighbours; whether it is at the border of the grid; its number.
     """
     rows, columns = window.field["heights"].shape[:2]
     count_down, count_right = window.points.x.shape[:2]
@@ -208,11 +237,15 @@ def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Ar
         present = (down + i >= 0) & (down + i < count_down) & (right + j >= 0) & (right + j < count_right)
         ways.append((way, present.reshape(-1, 1, 1)))
     d, r = down[..., None, None], right[..., None, None]
-    known = (d > 0) | (window.row == 0)
-    known &= (d < count_down - 1) | (window.row == rows - count_down)
-    known &= (r > 0) | (window.column == 0)
-    known &= (r < count_right - 1) | (window.column == columns - count_right)
-    return ways, listed(known), _point_numbers(window, None, None)
+    ends = (
+        (d == 0, window.row == 0),
+        (d == count_down - 1, window.row == rows - count_down),
+        (r == 0, window.column == 0),
+        (r == count_right - 1, window.column == columns - count_right),
+    )
+    known = functools.reduce(operator.and_, (~last | border for last, border in ends))
+    at_border = functools.reduce(operator.or_, (last & border for last, border in ends))
+    return ways, listed(known), listed(at_border), _point_numbers(window, None, None)
 
 
 def _point_numbers(window: Window, stop_down: int | None, stop_right: int | None) -> Array:

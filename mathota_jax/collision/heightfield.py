@@ -9,6 +9,7 @@ ground has no contact of its own, and no ghost normal.
 - Ridges: a search along the arc of normals by bisection; only the support function of the body is needed.
 - Peaks: the closed-form distance of a point from the body.
 - The points on which the body would stand on a plane, each against the triangle under it: they span the base.
+- Beside the field: the points nearest to the wall under its border, instead of what would lift the body over it.
 
 The deepest of all these and up to three that differ most from it are kept.
 
@@ -37,11 +38,13 @@ from mathota_jax.collision.height_grid import (
     peak_cones,
     triangles,
 )
-from mathota_jax.collision.heightfield_ridges import ridge_contacts
+from mathota_jax.collision.heightfield_ridges import looks_up, ridge_contacts
+from mathota_jax.collision.heightfield_walls import LEVEL, Wall, along_wall, depth_under, nearest_wall
 from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import compute_once, settle
+from mathota_jax.spatial.spread import least
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm, where
 
 SEAM = 1e-5
@@ -56,6 +59,8 @@ MERGE = 1e-3
 """Contacts closer than this share of the body's size, normals included, are one."""
 HEIGHT_WEIGHT = 10.0
 """A contact higher than the deepest one must widen the base by this many times the height (see `plane_polyhedron`)."""
+WALL_FEATURES = 1024
+"""More than the features of a plane with any shape."""
 ABSENT = 1e6
 """Separation, in units of the body's size, where there is no ground."""
 
@@ -91,8 +96,8 @@ class Candidates(NamedTuple):
 def heightfield_contacts(known: Kind, a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: Pose) -> Manifold:
     """Up to four contacts of a convex shape with a heightfield, the deepest first.
 
-    Every point has its own normal; that of the manifold is the deepest one's. Where there is no ground under the body no
-    point is active.
+    Every point has its own normal; that of the manifold is the deepest one's. Where there is no ground under the body and
+    no wall beside it no point is active.
 
     Args:
         known: Kind of A.
@@ -110,16 +115,25 @@ def heightfield_contacts(known: Kind, a: dict[str, Any], pose_a: Pose, b: dict[s
     window = grid_window(b, center, b["window"])
     size = lax.stop_gradient(bounding_radius(kind, a)) + jnp.zeros_like(center.x)
 
-    found = [
-        *_face_contacts(kind, a, rotation, window),
-        _ridges(kind, a, rotation, window),
-        _peaks(known, a, rotation, window),
-    ]
-    if known.flat_contacts is not None:
-        found.append(_base(known.flat_contacts, a, rotation, window, _joined(found), size))
-    candidates = _joined(found)
-    base_count = 0 if known.flat_contacts is None else found[-1].separation.shape[0]
-    chosen = _reduced(candidates, size, base_count)
+    wall = nearest_wall(kind, a, rotation, window, size)
+    ridges, at_border = _ridges(kind, a, rotation, window, size, wall.level)
+    upper = _joined(
+        [*_face_contacts(kind, a, rotation, window), ridges, _peaks(known, a, rotation, window, wall.level)]
+    )
+    # What lies deeper than the wall would lift a body over the border that comes in from beside.
+    lifts = wall.beside & (lax.stop_gradient(upper.separation) < -wall.way - MERGE * size)
+    upper = upper._replace(valid=upper.valid & ~lifts)
+    if known.flat_contacts is None:
+        base = _wall_cores(kind, a, rotation, window, wall, size)
+    else:
+        base = _base(known.flat_contacts, a, rotation, window, upper, wall, size)
+    candidates = _joined([upper, base])
+    # The same holds for an edge of a wall; in between the body lies on both.
+    overlap = jnp.where(ridges.valid & at_border, -lax.stop_gradient(ridges.separation), 0.0)
+    way_out = least(jnp.where(overlap > 0, overlap, ABSENT * size)) + LEVEL * size
+    shallow = lax.stop_gradient(candidates.separation) > -way_out
+    candidates = candidates._replace(valid=candidates.valid & (settle(shallow.astype(size.dtype)) > 0.5))
+    chosen = _reduced(candidates, size, base.separation.shape[0])
     return _manifold(candidates, chosen, size, pose_a, pose_b)
 
 
@@ -139,12 +153,8 @@ def _inflation(kind: str, a: dict[str, Any]) -> Any:
 def _face_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window) -> list[Candidates]:
     """Core points of the body against the triangles they are over (or, inside the ground, under)."""
     faces = triangles(window)
-    if kind == "sphere":
-        zero = jnp.zeros_like(faces.normal.x)
-        cores = [Vec3(zero, zero, zero)]
-    elif kind == "capsule":
-        half = rotation.column_y * a["half_height"]
-        cores = [-half, half]
+    if SUPPORT[kind].inflation is not None:
+        cores = _core_ends(kind, a, rotation, jnp.zeros_like(faces.normal.x))
     else:
         local = rotation.apply_transposed(-faces.normal)
         code = SUPPORT[kind].code(*lax.stop_gradient((a, local)))
@@ -161,6 +171,34 @@ def _face_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window)
     return found
 
 
+def _core_ends(kind: str, a: dict[str, Any], rotation: Mat3, zero: Array) -> list[Vec3]:
+    """Centre of a sphere, ends of a capsule's axis."""
+    if kind == "sphere":
+        return [Vec3(zero, zero, zero)]
+    half = rotation.column_y * a["half_height"]
+    return [-half, half]
+
+
+def _wall_cores(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, wall: Wall, size: Array) -> Candidates:
+    """Those against the wall."""
+    ends = _core_ends(kind, a, rotation, jnp.zeros_like(size))
+    core = Vec3(*(_stacked([end[axis] for end in ends], size) for axis in range(3)))
+    feature = jnp.arange(len(ends), dtype=jnp.int32).reshape(-1, 1, 1)
+    found = _on_wall(core, _inflation(kind, a), feature, window, wall, size)
+    return found._replace(valid=found.valid & wall.beside)
+
+
+def _on_wall(corner: Vec3, inflation: Any, feature: Array, window: Window, wall: Wall, size: Array) -> Candidates:
+    """Points of the body (candidate, pair, world) against the wall, those under the border."""
+    height = dot(wall.up, corner) - wall.offset
+    foot = corner - wall.up * height
+    under = depth_under(window, corner) > 0
+    valid = settle((under & along_wall(window, lax.stop_gradient(foot))).astype(height.dtype)) > 0.5
+    number = 9 * _grid_count(window) + WALL_FEATURES * (wall.number + 1) + feature
+    up = wall.up.map(lambda c: jnp.broadcast_to(c, height.shape))
+    return Candidates(foot, up, height - inflation, number, valid)
+
+
 def _over_face(
     window: Window, core: Vec3, foot: Vec3, height: Array, normal: Vec3, corner: Vec3, cell: Any, is_upper: Any
 ) -> Array:
@@ -174,12 +212,13 @@ def _over_face(
     return jnp.where(height >= 0, foot_inside, column_inside | (foot_inside & valley))
 
 
-def _ridges(kind: str, a: dict[str, Any], rotation: Mat3, window: Window) -> Candidates:
-    ridge = ridge_contacts(kind, a, rotation, window)
-    offset = 4 * _grid_count(window)
-    return Candidates(
-        ridge.ground, ridge.up, ridge.separation - _inflation(kind, a), offset + ridge.number, ridge.valid
-    )
+def _ridges(
+    kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, level: Array
+) -> tuple[Candidates, Array]:
+    """Contacts of ridges, and which of them are those of the border."""
+    ridge = ridge_contacts(kind, a, rotation, window, size, level)
+    number, separation = 4 * _grid_count(window) + ridge.number, ridge.separation - _inflation(kind, a)
+    return Candidates(ridge.ground, ridge.up, separation, number, ridge.valid), ridge.at_border
 
 
 def _grid_count(window: Window) -> int:
@@ -187,9 +226,9 @@ def _grid_count(window: Window) -> int:
     return rows * columns
 
 
-def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window) -> Candidates:
+def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window, level: Array) -> Candidates:
     """Grid points against the body, where the direction looks out of the ground."""
-    ways, complete, number = peak_cones(window)
+    ways, complete, at_border, number = peak_cones(window)
     points = window.points.map(listed)
     zero = jnp.zeros_like(points.x[0])
     body = Pose(Vec3(zero, zero, zero), rotation)
@@ -201,12 +240,12 @@ def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window) -> Ca
     up, separation = jax.vmap(distance)(points)
     direction = lax.stop_gradient(up)
     cell = lax.stop_gradient(window.field["cell_size"])
-    valid = complete & (direction.y > 0)
+    valid = complete & looks_up(direction, at_border, level)
     slack = jnp.where(_bends_down(ways, cell), LEANING, -FLAT) * cell
     for way, present in ways:
         valid &= ~present | (dot(direction, lax.stop_gradient(way)) < slack)
     valid = settle(valid.astype(separation.dtype)) > 0.5
-    return Candidates(points, up, separation, 7 * _grid_count(window) + number, valid)
+    return Candidates(points, up, separation, 8 * _grid_count(window) + number, valid)
 
 
 def _bends_down(ways: list[tuple[Vec3, np.ndarray]], cell: Array) -> Array:
@@ -223,25 +262,26 @@ def _base(
     rotation: Mat3,
     window: Window,
     others: Candidates,
+    wall: Wall,
     size: Array,
 ) -> Candidates:
-    """The points on which the body would stand on the plane of the deepest contact, each against its own ground."""
+    """The points on which the body would stand on the plane of the deepest contact, each against its own ground.
+
+    Beside the field those that lean on the wall.
+    """
     lowest = jnp.finfo(size.dtype).min
     score, code = best_candidate(jnp.where(others.valid, -others.separation, lowest))
     up = pick(others.up, code)
     none = score <= lowest
-    up = where(none, Vec3(0.0, 1.0, 0.0), up)
+    up = where(wall.beside, wall.up, where(none, Vec3(0.0, 1.0, 0.0), up))
     zero = jnp.zeros_like(size)
     flat = flat_contacts(
         {"normal": up, "offset": zero}, Pose(Vec3(zero, zero, zero)), a, Pose(Vec3(zero, zero, zero), rotation)
     )
 
-    def stacked(values: list[Array]) -> Array:
-        return jnp.stack([jnp.broadcast_to(value, zero.shape) for value in values])
-
     half = [point.position + up * (0.5 * point.separation) for point in flat.points]
-    corner = Vec3(*(stacked([point[axis] for point in half]) for axis in range(3)))
-    feature, active = (stacked([getattr(p, name) for p in flat.points]) for name in ("feature", "active"))
+    corner = Vec3(*(_stacked([point[axis] for point in half], size) for axis in range(3)))
+    feature, active = (_stacked([getattr(p, name) for p in flat.points], size) for name in ("feature", "active"))
 
     cell = window.field["cell_size"]
     below = ground_at(window, corner)
@@ -254,7 +294,15 @@ def _base(
     foot = corner - beside.normal * height
     inside = margin(*lax.stop_gradient((foot, beside.corner)), beside.is_upper, lax.stop_gradient(cell)) >= -SEAM
     valid = settle((below.exists & beside.exists & active & (inside | ~raised)).astype(height.dtype)) > 0.5
-    return Candidates(foot, beside.normal, height, 8 * _grid_count(window) + feature, valid)
+    standing = Candidates(foot, beside.normal, height, 9 * _grid_count(window) + feature, valid)
+    leaning = _on_wall(corner, 0.0, feature, window, wall, size)
+    leaning = leaning._replace(valid=leaning.valid & active)
+    return jax.tree.map(lambda on_wall, on_ground: jnp.where(wall.beside, on_wall, on_ground), leaning, standing)
+
+
+def _stacked(values: list[Array], like: Array) -> Array:
+    """(candidate, pair, world)."""
+    return jnp.stack([jnp.broadcast_to(value, like.shape) for value in values])
 
 
 def _joined(parts: list[Candidates]) -> Candidates:
@@ -280,11 +328,9 @@ def _reduced(candidates: Candidates, size: Array, base_count: int) -> tuple[Arra
     lowest = jnp.finfo(number).min
     share = depth_tolerance(number)
     lean = dot(LEAN, ground)
-    score = share * lean - separation
-    if base_count:
-        # The points of the base keep their ids from cell to cell; where others are equally deep these are taken.
-        is_base = (jnp.arange(score.shape[0]) >= score.shape[0] - base_count).reshape(-1, 1, 1)
-        score = score + jnp.where(is_base, 8.0 * share * size, 0.0)
+    # The points of the base keep their ids from cell to cell; where others are equally deep these are taken.
+    is_base = (jnp.arange(separation.shape[0]) >= separation.shape[0] - base_count).reshape(-1, 1, 1)
+    score = share * lean - separation + jnp.where(is_base, 8.0 * share * size, 0.0)
     best, first = best_candidate(jnp.where(valid, score, lowest))
     first = jnp.where(best > lowest, first, -1)
     ground0, up0, depth0 = pick((ground, up, separation), first)

@@ -22,18 +22,24 @@ CONVEX = 1e-5
 BEYOND = 0.05
 """The arc is searched beyond its ends by this share: a body that lies on one slope and juts out over the ridge has its
 best direction exactly at the end."""
+OVER = 0.5
+"""Sine of the slope from which what is level with the border, and about to come over it, meets it."""
 LARGEST_CORRECTION = 1e-2
 """The Newton step [rad] is held to this; only where the body's corner touches the ridge itself is it without bound."""
 
 
 class Ridges(NamedTuple):
-    """Contacts of ridges, components (edge, pair, world); see `heightfield.Candidates`. The separation is the core's."""
+    """Contacts of ridges, components (edge, pair, world); see `heightfield.Candidates`. The separation is the core's.
+
+    `at_border` says which edges are those of a wall.
+    """
 
     ground: Vec3
     up: Vec3
     separation: Array
     number: Array
     valid: Array
+    at_border: Array
 
 
 class _Extreme(NamedTuple):
@@ -45,14 +51,14 @@ class _Extreme(NamedTuple):
     interior: Array
 
 
-def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window) -> Ridges:
-    """Contacts with all edges of the window that are ridges.
+def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, level: Array) -> Ridges:
+    """Contacts with all edges of the window that are ridges, for bodies of that size [m], level with the border or not.
 
     The parting ``g(up) = min over the body of up . (x - ridge)`` has the derivative ``(along x up) . (x - ridge)``; at
     its maximum on the arc either one piece of the body is straight over the ridge or two pieces tie. That condition
     determines the direction differentiably; the derivative of the parting does not depend on it (envelope theorem).
     """
-    edge = edges(window)
+    edge = edges(window, size)
     found = _search(kind, *lax.stop_gradient((a, rotation, edge)))
     # The bisection's direction is made exact first: a step from an inexact one has inexact derivatives.
     exact, *_ = _step(kind, *lax.stop_gradient((a, rotation, edge)), found)
@@ -66,9 +72,20 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window)
     separation = dot(up, body)
     run = dot(along, body)
     ground = edge.start + along * run
-    valid = lax.stop_gradient((run >= -CONVEX * length) & (run <= (1.0 + CONVEX) * length) & (up.y > 0))
+    valid = lax.stop_gradient((run >= -CONVEX * length) & (run <= (1.0 + CONVEX) * length))
+    at_border = (edge.minus.y == 0) | (edge.plus.y == 0)
+    valid &= looks_up(lax.stop_gradient(up), at_border, level) | (edge.upright & ~level)
     valid = settle((valid & found.interior).astype(run.dtype)) > 0.5
-    return Ridges(ground, up, separation, edge.number, valid)
+    return Ridges(ground, up, separation, edge.number, valid, at_border)
+
+
+def looks_up(direction: Vec3, at_border: Array, level: Array) -> Array:
+    """Whether a contact with an edge or a peak may have a direction.
+
+    It looks out of the ground above or, at the border, sideways; a body that is level with the border would stumble there
+    over what it is about to slide over.
+    """
+    return direction.y > jnp.where(at_border, jnp.where(level, OVER, -BEYOND), 0.0)
 
 
 def _step(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, found: _Extreme) -> tuple[Vec3, Vec3, Vec3, Vec3]:
@@ -113,11 +130,13 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extre
         return code, settle_code(grows.astype(share.dtype))
 
     zero = jnp.zeros_like(along.x)
-    low, high = zero - BEYOND, zero + 1.0 + BEYOND
-    piece_minus, grows = evaluate(low)
-    piece_plus, still_grows = evaluate(high)
+    pieces, grows = evaluate(jnp.stack([zero - BEYOND, zero, zero + 1.0, zero + 1.0 + BEYOND]))
+    # Within the arc first: of a body that overlaps, the parting may grow again beyond the ends.
+    within = (grows[1] == 1) & (grows[2] == 0)
+    low, high = jnp.where(within, 0.0, -BEYOND) + zero, jnp.where(within, 1.0, 1.0 + BEYOND) + zero
+    piece_minus, piece_plus = jnp.where(within, pieces[1], pieces[0]), jnp.where(within, pieces[2], pieces[3])
     convex = dot(cross(edge.minus, edge.plus), along) > CONVEX
-    interior = edge.exists & convex & (grows == 1) & (still_grows == 0)
+    interior = edge.exists & convex & (within | ((grows[0] == 1) & (grows[3] == 0)))
 
     def halve(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, piece_minus, piece_plus = state

@@ -1,4 +1,4 @@
-"""Where a ray meets a heightfield: a walk along the ray through the triangles below it, a fixed number of them."""
+"""Where a ray meets a heightfield: at a wall, or by a walk through the triangles below it, a fixed number of them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from jax import Array, lax
 from mathota_jax.collision.height_grid import gather_heights
 from mathota_jax.collision.ray_frame import PARALLEL, LocalRay, RayHit, far, hit_at, local_ray, slab
 from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.settle import settle
-from mathota_jax.spatial.vector import Vec3, norm
+from mathota_jax.spatial.settle import settle, settle_code
+from mathota_jax.spatial.vector import Vec3, norm, where
 
 
 class _GridRay(NamedTuple):
@@ -36,7 +36,7 @@ class _Walk(NamedTuple):
 
 
 def ray_heightfield(field: dict[str, Any], pose: Pose, origin: Vec3, direction: Vec3) -> RayHit:
-    """First place where a ray comes from above the surface to below it.
+    """First place where a ray comes from above the surface to below it, or through a wall under the border.
 
     Along the ray the surface is straight between the places where the ray passes a grid line or a diagonal (J. Amanatides
     and A. Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987). The height over the surface is carried from one
@@ -64,7 +64,39 @@ def ray_heightfield(field: dict[str, Any], pose: Pose, origin: Vec3, direction: 
     parameter = jnp.where(usable, -gap / jnp.where(usable, rate, -1.0), lax.stop_gradient(walk.parameter))
     normal = Vec3(-slope_u / cell, jnp.ones_like(slope_u), -slope_v / cell)
     normal = normal / norm(normal)
+    axis = _wall(*lax.stop_gradient((grid, ray, heights)))
+    through = [
+        -(p + jnp.sign(rate) * 0.5 * (count - 1)) / jnp.where(jnp.abs(rate) > PARALLEL, rate, 1.0)
+        for p, rate, count in (
+            (grid.u - 0.5 * (rows - 1), grid.du, rows),
+            (grid.v - 0.5 * (columns - 1), grid.dv, columns),
+        )
+    ]
+    parameter = jnp.where(axis == 1, through[0], jnp.where(axis == 2, through[1], parameter))
+    zero = jnp.zeros_like(parameter)
+    normal = where(axis == 1, Vec3(-jnp.sign(grid.du), zero, zero), normal)
+    normal = where(axis == 2, Vec3(zero, zero, -jnp.sign(grid.dv)), normal)
+    code = jnp.where(axis > 0, 0, code)
     return hit_at(pose, ray, code, parameter, normal.map(lambda c: jnp.where(code >= 0, c, 0.0)))
+
+
+def _wall(grid: _GridRay, ray: LocalRay, heights: Array) -> Array:
+    """Whether a ray comes from outside through a wall: 1 for one at an end of x, 2 of z, 0 for none."""
+    rows, columns = heights.shape[:2]
+    enter_u, leave_u = slab(grid.u - 0.5 * (rows - 1), grid.du, 0.5 * (rows - 1))
+    enter_v, leave_v = slab(grid.v - 0.5 * (columns - 1), grid.dv, 0.5 * (columns - 1))
+    enter = jnp.maximum(enter_u, enter_v)
+    comes_in = (enter >= ray.begin) & (enter <= jnp.minimum(leave_u, leave_v))
+    at = jnp.where(comes_in, enter, ray.begin)
+    below = ~_above(grid, heights, at, *_triangle(grid, at, rows, columns))
+    return settle_code(jnp.where(comes_in & below, jnp.where(enter_u > enter_v, 1.0, 2.0), 0.0).astype(enter.dtype))
+
+
+def _above(grid: _GridRay, heights: Array, parameter: Array, row: Array, column: Array, upper: Array) -> Array:
+    """Whether a ray is not below the plane of a triangle, at a parameter."""
+    height, slope_u, slope_v = _plane(heights, row, column, upper)
+    u, v = grid.u + parameter * grid.du, grid.v + parameter * grid.dv
+    return grid.y + parameter * grid.dy >= height + slope_u * (u - row) + slope_v * (v - column)
 
 
 def _search(grid: _GridRay, ray: LocalRay, heights: Array, cell: Array) -> _Walk:
@@ -83,11 +115,6 @@ def _search(grid: _GridRay, ray: LocalRay, heights: Array, cell: Array) -> _Walk
     start, end = settle(start), settle(end)
     none = jnp.full(start.shape, -1, jnp.int32)
 
-    def over(parameter: Array, row: Array, column: Array, upper: Array) -> Array:
-        height, slope_u, slope_v = _plane(heights, row, column, upper)
-        u, v = grid.u + parameter * grid.du, grid.v + parameter * grid.dv
-        return grid.y + parameter * grid.dy - (height + slope_u * (u - row) + slope_v * (v - column))
-
     def turn(_: Array, walk: _Walk) -> _Walk:
         here = walk.parameter
         following = jnp.minimum(jnp.minimum(_next(grid.u, grid.du, here), _next(grid.v, grid.dv, here)), end)
@@ -95,8 +122,8 @@ def _search(grid: _GridRay, ray: LocalRay, heights: Array, cell: Array) -> _Walk
         middle = 0.5 * (here + following)
         row, column, upper = _triangle(grid, middle, rows, columns)
         first = walk.parameter == start
-        above = jnp.where(first, over(here, row, column, upper) >= 0, walk.above)
-        below = settle((over(following, row, column, upper) < 0).astype(here.dtype)) > 0.5
+        above = jnp.where(first, _above(grid, heights, here, row, column, upper), walk.above)
+        below = settle((~_above(grid, heights, following, row, column, upper)).astype(here.dtype)) > 0.5
         found = above & below & (walk.row < 0) & (here < end)
         return _Walk(
             jnp.where(walk.row < 0, following, here),

@@ -19,8 +19,8 @@ class Heightfield(Shape):
     the grid is centred at the body origin. The diagonal from ``(i, j)`` to ``(i + 1, j + 1)`` cuts each cell into two
     triangles.
 
-    There are no walls under the border: what is beside it and below its edge touches nothing, and what comes in from there
-    is lifted to the surface, with `Flag.DEEP_OVERLAP`. Put boxes there where something may come in from beside.
+    Below its border the solid ends in four vertical walls, however far down. A body whose lowest point is level with the
+    border, to 2 % of its size, meets no wall but slides onto the field.
 
     Args:
         heights: Heights [m], shape ``(rows, columns)``, at least 2 x 2, finite.

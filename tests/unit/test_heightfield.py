@@ -18,13 +18,9 @@ from mathota_jax.collision.pairs.plane_cone import plane_cone
 from mathota_jax.collision.pairs.plane_cylinder import plane_cylinder
 from mathota_jax.collision.pairs.plane_polyhedron import plane_polyhedron
 from mathota_jax.collision.pairs.plane_sphere import plane_sphere
-from mathota_jax.geometry import SHAPES
-from mathota_jax.geometry.hull import padded_faces
 from mathota_jax.queries import Geometry, manifold, signed_distance
-from mathota_jax.spatial.pose import Pose
-from mathota_jax.spatial.quaternion import Quaternion, to_matrix
 from mathota_jax.spatial.vector import Vec3
-from tests.hulls import hull
+from tests.heightfields import CELL, REACH, SIZES, STONE, STONE_FACES, UPRIGHT, field_of, natural, place, run, shape_of
 from tests.marks import slow_but
 from tests.scenes import undamped
 
@@ -40,88 +36,6 @@ KINDS = list(FUNCTIONS)
 QUICK_AND_SLOW_KINDS = [
     kind if kind in ("sphere", "box") else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS
 ]
-STONE = np.random.default_rng(7).normal(size=(12, 3)) * [0.25, 0.2, 0.3]
-STONE, STONE_FACES = hull(STONE)
-SIZES = {
-    "sphere": {"radius": np.array(0.3)},
-    "capsule": {"radius": np.array(0.15), "half_height": np.array(0.35)},
-    "box": {"half_extents": np.array([0.3, 0.15, 0.25])},
-    "cylinder": {"radius": np.array(0.25), "half_height": np.array(0.2)},
-    "cone": {"radius": np.array(0.3), "half_height": np.array(0.2)},
-    "polyhedron": {"vertices": STONE},
-}
-CELL = 0.25
-REACH = {kind: float(SHAPES[kind].reach_of(sizes)) for kind, sizes in SIZES.items()}
-
-
-def vec(values):
-    """Natural (..., 3) as a Vec3 of components (1, ...)."""
-    return Vec3(*(jnp.asarray(values)[None, ..., axis] for axis in range(3)))
-
-
-def place(position, orientation):
-    q = jnp.asarray(orientation)
-    return Pose(vec(position), to_matrix(Quaternion(*(q[None, ..., k] for k in range(4)))))
-
-
-def shape_of(kind, sizes):
-    """Parameters of one shape for pair functions."""
-    if kind == "polyhedron":
-        vertices = jnp.asarray(sizes["vertices"])
-        return {
-            "vertices": Vec3(*(vertices[:, axis, None, None] for axis in range(3))),
-            "faces": padded_faces([STONE_FACES]),
-        }
-    return {
-        name: Vec3(*(jnp.asarray(v)[k].reshape(1, 1) for k in range(3))) if np.ndim(v) else jnp.reshape(v, (1, 1))
-        for name, v in sizes.items()
-    }
-
-
-def field_of(heights, cell=CELL, reach=0.5):
-    """Parameters of one heightfield, heights (rows, columns)."""
-    return {
-        "heights": jnp.asarray(heights)[:, :, None, None],
-        "cell_size": jnp.reshape(cell, (1, 1)),
-        "window": window_size(reach, float(CELL)),
-    }
-
-
-UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-def run(kind, heights, position, orientation, field_pose=None, sizes=None, cell=CELL):
-    """Manifolds of many poses (world, 3), (world, 4); natural NumPy arrays with the points first."""
-    field_pose = (np.zeros(3), UPRIGHT) if field_pose is None else field_pose
-    position, orientation = np.atleast_2d(position), np.atleast_2d(orientation)
-
-    def function(position, orientation):
-        pose = place(position, orientation)
-        return PAIRS[kind, "heightfield"].function(
-            shape_of(kind, SIZES[kind] if sizes is None else sizes),
-            Pose(pose.position) if kind == "sphere" else pose,
-            field_of(heights, cell, REACH[kind]),
-            place(field_pose[0][None], field_pose[1][None]),
-        )
-
-    return natural(jax.jit(function)(position, orientation), len(position))
-
-
-def natural(found, count):
-    def full(x):
-        return np.broadcast_to(np.asarray(x), (1, count))[0]
-
-    def vector(v):
-        return np.stack([full(c) for c in v], -1)
-
-    return {
-        "normal": np.stack([vector(p.normal if p.normal is not None else found.normal) for p in found.points]),
-        "position": np.stack([vector(p.position) for p in found.points]),
-        **{
-            name: np.stack([full(getattr(p, name)) for p in found.points])
-            for name in ("separation", "feature", "active")
-        },
-    }
 
 
 def poses(count, seed, spread=0.5, height=(0.0, 0.6)):
@@ -379,19 +293,6 @@ def test_derivatives_are_those_of_differences(kind, float64, gate):
     gradient = jax.jit(jax.grad(lambda x: jnp.sum(weights * deepest(kind, *x)[0])))(arguments)
     total = sum(jnp.sum(g * t) for g, t in zip(jax.tree.leaves(gradient), jax.tree.leaves(tangents), strict=True))
     gate("reverse mode", total / jnp.sum(weights * rate) - 1.0, 1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_beside_the_field_there_is_no_ground(kind, precision):
-    reach = REACH[kind]
-    edge = 5.0 * CELL + reach
-    position = np.array([[edge + 0.01, -1.0, 0.0], [-50.0, -3.0, 80.0], [0.0, -1.0, 1e5], [0.0, 0.0, 0.0]])
-    orientation = np.tile(UPRIGHT, (4, 1))
-    found = run(kind, np.zeros((11, 11)), position, orientation)
-    assert not found["active"][:, :3].any() and found["active"][0, 3]
-    assert all(np.isfinite(value).all() for value in found.values())
-    assert (found["separation"][:, :3] > 1e3 * reach).all()
 
 
 # ---- features ----------------------------------------------------------------------------------------------------

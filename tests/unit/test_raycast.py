@@ -83,7 +83,7 @@ def level(shape, p):
     one = heights[i, j] * (1 - fu) + heights[i + 1, j] * (fu - fv) + heights[i + 1, j + 1] * fv
     two = heights[i, j] * (1 - fv) + heights[i, j + 1] * (fv - fu) + heights[i + 1, j + 1] * fu
     beyond = np.maximum(np.maximum(-u, u - rows + 1), np.maximum(-v, v - columns + 1)) * shape.cell_size
-    return np.maximum(y - np.where(fu > fv, one, two), np.where(beyond > 0, 1.0, -np.inf))
+    return np.maximum(y - np.where(fu > fv, one, two), beyond)
 
 
 def size_of(shape):
@@ -112,8 +112,6 @@ def oracle(shape, origin, direction, reach):
     deepest = np.where(hit, np.where(after, np.inf, values).min(0), values.min(0))
     doubt = min(2e-3, 0.1 * shape.inradius())
     clear = np.where(hit, deepest < -doubt, deepest > doubt)
-    if isinstance(shape, Heightfield):  # through the side of the ground there is no surface
-        clear &= ~hit | (level(shape, origin + (low - 1e-9)[:, None] * unit) < 1e-6)
     return np.where(hit, low, np.nan), clear
 
 
