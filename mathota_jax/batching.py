@@ -60,7 +60,8 @@ def batch_last(
 
     Args:
       function: pure function of pytrees. Every array it receives has its natural axes followed by ONE world axis, whose
-        size is the number of worlds or 1 (argument shared by all worlds); every array it returns likewise.
+        size is the number of worlds or 1 (argument shared by all worlds; of an argument with a true `in_each_world` that
+        of the worlds); every array it returns likewise.
       shortcut: how derivatives compute it again; None for as it is.
       in_parts: whether large batches are computed in parts that stay in the cache, on CPUs and where it pays. Not for what
         is done in few numbers for each world: of some hundred, kernels take longer to launch than to run.
@@ -91,7 +92,17 @@ class TreeFunction:
     in_parts: bool = False
 
     def __call__(self, *leaves: Array) -> Any:
-        return self.function(*jax.tree.unflatten(self.in_tree, leaves))
+        return self.function(*self._arguments(leaves))
+
+    def _arguments(self, leaves: Sequence[Array]) -> list[Any]:
+        """What belongs to each world is given in each, though what is mapped may be something else."""
+        worlds = max((leaf.shape[-1] for leaf in leaves), default=1)
+
+        def in_each(leaf: Array) -> Array:
+            return jnp.broadcast_to(leaf, (*leaf.shape[:-1], worlds))
+
+        arguments = jax.tree.unflatten(self.in_tree, leaves)
+        return [jax.tree.map(in_each, a) if getattr(a, "in_each_world", False) else a for a in arguments]
 
     def again(self, shortcut: Shortcut, result: Any, leaves: Sequence[Array]) -> tuple[TreeFunction, list[Array]]:
         """The function by its shortcut, and the arrays that it needs before the arguments."""

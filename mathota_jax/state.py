@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import operator
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -107,6 +107,8 @@ class State:
       sleep: timers of the sleeping system; None unless `Options.sleep`.
       end_forces: from which the small steps start; None unless a scene takes them (``Options.solver``).
     """
+
+    in_each_world: ClassVar[bool] = True
 
     position: Array
     orientation: Array

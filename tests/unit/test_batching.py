@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Hinge, Plane, SceneBuilder, Sphere, contacts, rollout, step
+from mathota_jax import Box, Hinge, Plane, SceneBuilder, Sphere, contacts, joint_gaps, residuals, rollout, step
 from tests.marks import slow_but
-from tests.scenes import sphere_on_plane, stack, undamped
+from tests.scenes import slab_on_plane, sphere_on_plane, stack, undamped
 
 WORLDS, STEPS = 3, 3
 
@@ -212,6 +212,53 @@ def test_one_mapped_leaf_of_the_model(float64):
         step(dataclasses.replace(base, friction=f), s, a) for f, s, a in zip(frictions, states, actions, strict=True)
     ]
     assert_states_equal(measured, stack(truth))
+
+
+LEAVES_ALONE = ("friction", "restitution", "mass", "shapes", "size", "joint_anchor_child", "joint_damping", "gravity")
+
+
+@pytest.mark.parametrize("name", slow_but(("friction", "shapes"), LEAVES_ALONE))
+@pytest.mark.parametrize("function", [step, joint_gaps, residuals])
+def test_one_leaf_alone_is_mapped(name, function):
+    """The state was given once, and was looked at for how many worlds there are."""
+    model, state = arm_and_box()
+    factors = jnp.asarray([0.9, 1.0, 1.2])
+
+    def outcome(factor):
+        leaf = jax.tree.map(lambda x: x * factor, getattr(model, name))
+        return function(dataclasses.replace(model, **{name: leaf}), state)
+
+    shapes = jax.eval_shape(jax.vmap(outcome), factors)
+    alone = jax.eval_shape(outcome, factors[0])
+    assert jax.tree.map(lambda x: x.shape[1:], shapes) == jax.tree.map(lambda x: x.shape, alone)
+
+
+def arm_and_box():
+    builder = SceneBuilder()
+    surface = {"friction": 0.4, "restitution": 0.5}
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True, **surface)
+    first, second = (
+        builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, position=(0.25 * k, 0.1, 0), velocity=(1, 0, 0), **surface)
+        for k in range(2)
+    )
+    builder.add_joint(Hinge(parent=first, child=second, anchor=(0.125, 0.1, 0), axis=(0, 1, 0), damping=0.1))
+    return builder.build()
+
+
+def test_slides_by_friction_alone():
+    """Only the friction is mapped, all else is given once: each world is that of its friction."""
+    model, state = slab_on_plane()
+    state = dataclasses.replace(state, velocity=state.velocity.at[1, 0].set(1.0))
+
+    def slid(friction):
+        changed = dataclasses.replace(model, friction=jnp.full_like(model.friction, friction))
+        return rollout(changed, state, 20)[0].velocity[1, 0]
+
+    frictions = jnp.asarray([0.1, 0.2, 0.4])
+    seconds = 20 * float(model.dt)
+    np.testing.assert_allclose(jax.vmap(slid)(frictions), 1.0 - frictions * 9.81 * seconds, atol=1e-4)
+    slopes = jax.vmap(jax.grad(slid))(frictions)
+    np.testing.assert_allclose(slopes, -9.81 * seconds, rtol=1e-3)
 
 
 @pytest.mark.parametrize("solver", ["pgs", "soft_step"])
