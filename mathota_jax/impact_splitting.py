@@ -9,19 +9,21 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mathota_jax.bodies import merge, moving, moving_inertia, unpack
+from mathota_jax.bodies import Bodies, merge, moving, moving_inertia, unpack
 from mathota_jax.constraints import collisions, contact, joint_layout
 from mathota_jax.constraints.lever import levers
 from mathota_jax.constraints.problem import constrain, starting_impulses
-from mathota_jax.dynamics.flight import flight, with_static
+from mathota_jax.dynamics.flight import Flight, flight, with_static
 from mathota_jax.dynamics.impact_times import FirstImpact, first_impact
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.model import Model
 from mathota_jax.outcome import forces, new_state
 from mathota_jax.phases import correct_positions, external, free_velocities, gravity, solve_rows
 from mathota_jax.scene import Scene
-from mathota_jax.spatial.indexing import in_every_world
+from mathota_jax.spatial.indexing import in_every_world, take
+from mathota_jax.spatial.quaternion import Quaternion, multiply
 from mathota_jax.spatial.settle import compute_once, materialize
+from mathota_jax.spatial.vector import cross
 from mathota_jax.state import State
 
 
@@ -100,7 +102,8 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     lever, beyond = levers(scene, left, problem.joint_rows, problem.contact_rows, impulses, packed, solved)
     moved, displacement = advance(blocks, inertia, inertia, None, free, torque, decay, solved, lever, left, beyond)
     path = flight(blocks, inertia, free, torque, decay, solved, left)
-    quiet = FirstImpact(left, jnp.zeros_like(split))
+    nobody = jnp.zeros((scene.body_count, *left.shape), left.dtype)
+    quiet = FirstImpact(left, jnp.zeros_like(split), nobody)
     assert problem.contacts is not None
     gaps = problem.contacts.separation
     impact = lax.cond(
@@ -109,9 +112,10 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
         lambda path: quiet,
         path,
     )
+    delay = take(impact.delay, scene.dynamic_bodies)
     moved, displacement = jax.tree.map(
         lambda split, whole: jnp.where(impact.happens, split, whole),
-        path.at(impact.time[None]),
+        path.at(impact.time + delay),
         (moved, displacement),
     )
     moved, displacement = compute_once((moved, displacement), state.position)
@@ -125,8 +129,24 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
         lambda moved: (moved, [jnp.zeros_like(mean) for mean in means]),
         moved,
     )
+    moved = _back(path, moved, delay)
     new = new_state(scene, state, moved, kept, failed)
     new = dataclasses.replace(new, applied_force=state.applied_force, applied_torque=state.applied_torque)
     total = [old + mean + more for old, mean, more in zip(progress.forces, means, added, strict=True)]
     after = _Progress(new, left - impact.time, progress.ended | ~impact.happens, total)
     return jax.tree.map(lambda old, new: jnp.where(progress.ended, old, new), progress, after)
+
+
+def _back(path: Flight, moved: Bodies, delay: Array) -> Bodies:
+    """The bodies as they would be now, had they met something after a `delay` (body, world) that is 0: its derivative."""
+    inertia = path.inertia if path.inertia.rotation is None else path.inertia.at(moved.orientation)
+    spin = moved.angular_velocity
+    turning = inertia.solve(path.torque - cross(spin, inertia.apply(spin)))
+    half = spin * (-0.5 * delay)
+    turned = multiply(Quaternion(jnp.zeros_like(half.x), *half), moved.orientation)
+    return Bodies(
+        moved.position - moved.velocity * delay,
+        Quaternion(*(now + change for now, change in zip(moved.orientation, turned, strict=True))),
+        moved.velocity - path.acceleration * delay,
+        spin - turning * delay,
+    )

@@ -14,15 +14,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-from mathota_jax.bodies import smaller_moving
+from mathota_jax.bodies import Bodies, smaller_moving
 from mathota_jax.collision.narrowphase import find_contacts
 from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
 from mathota_jax.dynamics.flight import Flight
 from mathota_jax.dynamics.pair_motion import contacts_between, reaches, turning
 from mathota_jax.model import Model
-from mathota_jax.scene import PairGroup
+from mathota_jax.scene import PairGroup, Scene
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle
@@ -42,10 +43,12 @@ class FirstImpact(NamedTuple):
     Attributes:
       time: (world,) [s]; the end of the time searched where there is none.
       happens: (world,) bool.
+      delay: (body, world) [s] by which bodies that meet then in another pair do so later: 0, with the derivative of that.
     """
 
     time: Array
     happens: Array
+    delay: Array
 
 
 class _Search(NamedTuple):
@@ -98,8 +101,8 @@ def first_impact(
         best = jnp.minimum(best, jnp.where(touches, time, jnp.inf).min(0))
         happens = happens | touches.any(0)
         slots.append(jnp.repeat(jnp.where(touches, time, jnp.inf), group.point_count, axis=0))
-    time = _with_derivative(model, flight, end, best, happens, jnp.concatenate(slots), jnp.concatenate(levels))
-    return FirstImpact(jnp.where(happens, time, left), happens)
+    time, delay = _with_derivative(model, flight, end, best, happens, jnp.concatenate(slots), jnp.concatenate(levels))
+    return FirstImpact(jnp.where(happens, time, left), happens, delay)
 
 
 def _search(
@@ -202,25 +205,67 @@ def _by_point(values: Array, count: int, shape: tuple[int, int]) -> list[Array]:
 
 def _with_derivative(
     model: Model, flight: Flight, end: Array, time: Array, happens: Array, meets: Array, level: Array
-) -> Array:
+) -> tuple[Array, Array]:
     """The time where something happens, refined by one step of Newton's method, which carries the derivative.
 
     `meets` and `level` are the time of the pair of each slot and the gap at which it touches.
+
+    Returns:
+      The time, and the delays of other pairs that meet then (see `FirstImpact`).
     """
 
-    def gaps(time: Array) -> tuple[Array, Array]:
+    def gaps(time: Array) -> tuple[Array, tuple[Array, Bodies]]:
         placed, _ = flight.at(time[None])
         found = find_contacts(model.scene, model.shapes, placed.position, placed.orientation)
-        return found.separation - level, found.active
+        return found.separation - level, (found.active, placed)
 
-    (gap, active), (rate, _) = jax.jvp(gaps, (time,), (jnp.ones_like(time),))
+    (gap, (active, placed)), (rate, _) = jax.jvp(gaps, (time,), (jnp.ones_like(time),))
     rate = lax.stop_gradient(rate)
     # The point that meets: the deepest of those of the pairs that meet now and approach.
     candidate = active & (meets <= time) & (rate < 0)
-    depth = jnp.where(candidate, lax.stop_gradient(gap), jnp.inf)
-    first = jnp.argmin(depth, 0)[None] == jnp.arange(depth.shape[0])[:, None]
-    chosen = settle(jnp.where(candidate & first, 1.0, 0.0))
-    step = -safe_divide((chosen * gap).sum(0), (chosen * rate).sum(0))
+    step = _step_of_deepest(candidate, gap, rate)[0]
     least = jnp.finfo(time.dtype).eps * end
     refined = jnp.clip(time + lax.stop_gradient(step), least, end)
-    return jnp.where(happens, refined + step - lax.stop_gradient(step), end)
+    candidate = candidate | (active & happens & _meets_too(model, lax.stop_gradient((placed, gap, rate))))
+    delay = jnp.where(happens, _delays(model.scene, candidate, gap, rate, step), 0.0)
+    return jnp.where(happens, refined + step - lax.stop_gradient(step), end), delay
+
+
+def _step_of_deepest(candidate: Array, gap: Array, rate: Array) -> tuple[Array, Array]:
+    """Newton's step of the deepest of the candidates (point, ..., world), 0 without one; and whether there is one."""
+    depth = jnp.where(candidate, lax.stop_gradient(gap), jnp.inf)
+    first = jnp.argmin(depth, 0)[None] == jnp.arange(depth.shape[0]).reshape(-1, *(1,) * (depth.ndim - 1))
+    chosen = settle(jnp.where(candidate & first, 1.0, 0.0))
+    return -safe_divide((chosen * gap).sum(0), (chosen * rate).sum(0)), chosen.sum(0) > 0.5
+
+
+def _meets_too(model: Model, found: tuple[Bodies, Array, Array]) -> Array:
+    """(slot, world) which points take part in the collision, and do not rest: those of `collisions.collide`."""
+    bodies, gap, rate = found
+    sides = model.scene.slot_bodies
+    size = smaller_moving(model, *sides)
+    scale = sum(take(norm(bodies.velocity), side) for side in sides)
+    rests = -rate <= rest_speed(norm(Vec3(*(model.gravity[axis][None] for axis in range(3)))), model.dt, size, scale)
+    return (gap <= 4.0 * tolerance(gap.dtype) * size) & ~rests
+
+
+def _delays(scene: Scene, candidate: Array, gap: Array, rate: Array, step: Array) -> Array:
+    """(body, world) 0, with the derivative of the time by which bodies meet later than the pair whose Newton step is given.
+
+    Where all pairs share one time, of those that meet at once only one would have the derivative of its own. A body that
+    meets several at once has the mean.
+    """
+    worlds = gap.shape[-1]
+    total, count = (jnp.zeros((scene.body_count, worlds), gap.dtype) for _ in range(2))
+    first = 0
+    for group in scene.pair_groups:
+        rows = slice(first, first + group.slot_count)
+        points = (jnp.stack(_by_point(v[rows], len(group.bodies_a), (0, worlds))) for v in (candidate, gap, rate))
+        of_pair, meets = _step_of_deepest(*points)
+        later = jnp.where(meets, of_pair - step, 0.0)
+        for side in (group.bodies_a, group.bodies_b):
+            total, count = total.at[np.asarray(side)].add(later), count.at[np.asarray(side)].add(meets * 1.0)
+        first += group.slot_count
+    moves = jnp.asarray(~np.asarray(scene.static))[:, None]
+    delay = jnp.where(moves & (count > 0), total / jnp.maximum(count, 1.0), 0.0)
+    return delay - lax.stop_gradient(delay)
