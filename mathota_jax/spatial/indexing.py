@@ -60,16 +60,16 @@ def gather(values: Array, index: Array) -> Array:
 
 
 def gather_together(tree: Any, index: Array) -> Any:
-    """Entries of all arrays (..., row, world or 1) of a pytree by traced rows (place, world): (..., place, world).
+    """Entries of all arrays (..., row or 1, world or 1) of a pytree by traced rows (place, world): (..., place, world).
 
     In one operation, and stored: a gather computed again in every kernel that reads it costs more than what follows, and
     one for each array costs the compiler a kernel each. What all worlds share is copied row by row, without an address for
     each number.
     """
     leaves, structure = jax.tree.flatten(tree)
-    worlds = max(leaf.shape[-1] for leaf in leaves)
+    rows, worlds = (max(leaf.shape[axis] for leaf in leaves) for axis in (-2, -1))
     parts = [leaf.reshape(-1, *leaf.shape[-2:]) for leaf in leaves]
-    table = jnp.concatenate([jnp.broadcast_to(part, (*part.shape[:2], worlds)) for part in parts])
+    table = jnp.concatenate([jnp.broadcast_to(part, (len(part), rows, worlds)) for part in parts])
     if worlds < index.shape[-1]:
         chosen = jnp.take(table[..., 0], index.reshape(-1), axis=1, mode="clip").reshape(-1, *index.shape)
     else:

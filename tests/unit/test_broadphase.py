@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mathota_jax import Box, Capsule, Compound, Plane, SceneBuilder, Sphere, step
 from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, Planes, candidate_pairs
 from mathota_jax.collision.broadphase.choice import choose_method
 from mathota_jax.pair_filter import make_filter
@@ -350,3 +351,18 @@ def test_method_follows_from_the_size_of_the_scene():
     assert choose_method(1024, 0, [0.1, 0.2]) == "grid"
     assert choose_method(1024, 0, mixed) == "sort_and_sweep"
     assert choose_method(100, 2000, mixed) == "bvh"
+
+
+@pytest.mark.parametrize("static", [False, True])
+@pytest.mark.parametrize("part", [Box((0.2, 0.1, 0.1)), Capsule(0.1, 0.2)], ids=["boxes", "capsules"])
+def test_all_shapes_of_a_kind_on_one_body(part, static):
+    """What a body gives all its shapes was one row beside one row for each: the step could not be traced."""
+    builder = SceneBuilder()
+    builder.add_body(Plane((0, 1, 0), 0.0), static=True)
+    parts = Compound([(part, ((side, 0, 0), (1, 0, 0, 0))) for side in (-0.2, 0.2)])
+    builder.add_body(parts, position=(0, 0.5, 0), **({"static": True} if static else {"mass": 1.0}))
+    for index in range(8):
+        builder.add_body(Sphere(0.1), mass=1.0, position=(0.3 * index, 1.5, 0))
+    model, state = builder.build()
+    assert model.scene.broadphase is not None
+    assert jax.eval_shape(lambda s: step(model, s), state).position.shape == (10, 3)

@@ -31,6 +31,15 @@ def test_entries_by_row(worlds):
     np.testing.assert_array_equal(counts["b"][1, 2], taken.sum(1, keepdims=True))
 
 
+def test_what_all_rows_share_is_given_once():
+    """As `take` gives what one body has in common for all its shapes."""
+    index = np.array([[1], [0], [2]], np.int32)
+    rows, shared = jnp.arange(3.0)[:, None], jnp.full((1, 1), 7.0)
+    found = gather_together((rows, shared), jnp.asarray(index))
+    np.testing.assert_array_equal(found[0], [[1.0], [0.0], [2.0]])
+    np.testing.assert_array_equal(found[1], np.full((3, 1), 7.0))
+
+
 def test_rows_of_arrays_of_one_shape():
     rng = np.random.default_rng(0)
     index = rng.integers(0, ROWS, (PLACES, WORLDS)).astype(np.int32)
