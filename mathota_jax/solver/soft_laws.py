@@ -288,6 +288,17 @@ def end_biases(groups: tuple[Group, ...], wanted: tuple[Array | None, ...], time
     return tuple(biases)
 
 
+def closing_speed(apart: Array | None, impulse: Array, present: Array, length: Array) -> Array | None:
+    """Speed (turn, row, column, world) at which rows may close that are open and needed no impulse in the soft sweeps.
+
+    They carry nothing, though they did in the last substep: a body that is lifted off its support would hang in the air.
+    """
+    if apart is None:
+        return None
+    speed = jnp.where(apart & (impulse[:, :1] <= 0), present / length, 0.0)
+    return jnp.concatenate([speed, jnp.zeros_like(impulse[:, 1:])], axis=1)
+
+
 def _drift(group: Group, time: Array, dt: Array) -> Array:
     """What the turning of a Jacobian adds to the rate: linear in time about the middle of the step."""
     curvature = group.error.curvature

@@ -33,6 +33,7 @@ from mathota_jax.solver.soft_laws import (
     Group,
     PositionError,
     apart_rows,
+    closing_speed,
     correction,
     end_biases,
     error_change,
@@ -123,12 +124,16 @@ def solve(
         velocity, impulses = _sweep(SWEEPS, rows, laws, biases, velocity + half, halves)
         displacement = displacement + length * velocity
         velocity = velocity * decay
+        closing = tuple(closing_speed(*parts, length) for parts in zip(apart, impulses, present, strict=True))
         impulses = tuple(first + second for first, second in zip(impulses, halves, strict=True))
         laws = tuple(
             rigid_law(group, impulse[:, :1] > 0, before)
             for group, impulse, before in zip(groups, impulses, lasting, strict=True)
         )
-        biases = end_biases(groups, wanted, end, dt)
+        biases = tuple(
+            bias if speed is None else bias + speed
+            for bias, speed in zip(end_biases(groups, wanted, end, dt), closing, strict=True)
+        )
         velocity, impulses = _sweep(SWEEPS, rows, laws, biases, velocity + half, impulses)
         total = tuple(before + impulse for before, impulse in zip(total, impulses, strict=True))
         # What the impulses changed in this substep is what they would change in the next one.

@@ -149,3 +149,18 @@ def test_a_rolling_cylinder_keeps_its_contacts(precision, gate):
         error[match] = np.abs(np.sort(held, axis=1)[:, 2:] / (0.5 * GRAVITY) - 1).max()
     gate("force at an end / half the weight - 1", error[Options().warm_start_match], 1e-4)
     assert error[0.0] > 0.01, "features alone lose it"
+
+
+@pytest.mark.parametrize("solver", ["pgs", "soft_step", "converged"])
+def test_what_is_lifted_off_its_support_falls(solver, float64, gate):
+    """By a user or by a support that moves away: the forces of the last step hold nothing up. It hung in the air."""
+    model, state = body_on_plane(
+        Box((0.1, 0.1, 0.1)), position=(0, 0.1, 0), options=undamped(dt=1 / 240, solver=solver)
+    )
+    settled = advance(model, state, 60)
+    count, lifts = 24, jnp.asarray([0.3, 0.06])
+    lifted = repeat(settled, 2)
+    lifted = dataclasses.replace(lifted, position=lifted.position.at[:, 1, 1].add(lifts))
+    _, record = record_worlds(repeat(model, 2), lifted, count, motion)
+    fallen = lifted.position[:, 1, 1] - record["position"][-1, :, 1, 1]
+    gate("way of the fall [m]", fallen - 0.5 * GRAVITY * (count / 240) ** 2, 1e-6)
