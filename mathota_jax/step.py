@@ -12,6 +12,7 @@ from jax import Array
 from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
+from mathota_jax.constraints.carried import resting
 from mathota_jax.constraints.lever import levers
 from mathota_jax.constraints.mechanism import Solutions
 from mathota_jax.constraints.mechanism_layout import layout, takes_small_steps
@@ -36,6 +37,7 @@ from mathota_jax.phases import (
 )
 from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once, materialize
+from mathota_jax.spatial.vector import norm
 from mathota_jax.state import Flag, State
 
 
@@ -179,6 +181,10 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     free, decay = compute_once(free_velocities(model, blocks, acting, halfway, force, torque), state.position)
     problem = constrain(model, state, bodies, blocks, acting, free, halfway, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
+    if scene.restitution and scene.options.solver == "converged" and problem.contact_rows:
+        last, _ = starting_impulses(model, state, problem, acting, packed)
+        last = last[len(problem.joint_rows) :]
+        problem = problem.with_contacts(resting(problem.contact_rows, last, norm(gravity(model)) * model.dt, model.dt))
     if uncut is not None:
         start, change = uncut, None
     elif known is not None:

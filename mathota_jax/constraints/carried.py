@@ -1,0 +1,52 @@
+"""Contacts that carry a load and approach next to nothing: they rest, whatever their restitution.
+
+Two bodies that lie on one another fall alike, so that nothing but the solution tells that one presses on the other. Any
+approach that is left of it would rebound as if both were weightless; solved exactly, such rebounds grow from round-off until
+gravity ends them: a stack at rest shakes for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jax import Array, lax
+
+from mathota_jax.constraints.contact import ContactRows, Load, normal_mass
+from mathota_jax.solver.rows import Rows, with_first_bias
+from mathota_jax.spatial.safe import safe_divide
+from mathota_jax.spatial.settle import settle
+from mathota_jax.spatial.spread import add_slices
+
+
+def resting(contacts: Sequence[ContactRows], last: Sequence[Array], fall: Array, dt: Array) -> list[ContactRows]:
+    """Contacts without the rebounds that what they carried in the last step ends within this one.
+
+    Args:
+      contacts: those of the step.
+      last: impulses (turn, row, column, world) of the last step.
+      fall: (1, world) velocity [m/s] that gravity gives in a step: a rebound that is faster leaves for longer.
+      dt: time step.
+    """
+    found = []
+    for contact, impulse in zip(contacts, last, strict=True):
+        bias = contact.rows.bias[:, :1]
+        # Of all points of a pair: one that carries nothing itself is held by the others.
+        carried = safe_divide(_of_pair(contact.rows, impulse), normal_mass(contact.rows))
+        ends = lax.stop_gradient((bias < 0) & (-bias <= jnp.minimum(fall, carried)))
+        rests = settle(jnp.where(ends, 1.0, 0.0)) > 0.5
+        assert contact.load is not None
+        # The impulse holds all through the step.
+        lever = jnp.where(rests, 0.5 * dt, contact.lever)
+        load = Load(jnp.where(rests, 0.0, contact.load.asked), jnp.where(rests, 0.5 * dt, contact.load.lever))
+        rows = with_first_bias(contact.rows, jnp.where(rests, 0.0, bias))
+        found.append(contact._replace(rows=rows, lever=lever, load=load))
+    return found
+
+
+def _of_pair(rows: Rows, impulse: Array) -> Array:
+    """(turn, 1, column, world) sum of the normal impulses of all points of the pair of each column."""
+    points = rows.table.together
+    normal = impulse[:, 0].reshape(len(impulse), -1, points, impulse.shape[-1])
+    total = jnp.broadcast_to(add_slices(normal, 2)[:, :, None], normal.shape)
+    return total.reshape(len(impulse), 1, -1, impulse.shape[-1])
