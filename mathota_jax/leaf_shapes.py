@@ -1,8 +1,7 @@
-"""Whether the leaves of a model and a state fit its scene, where a user has replaced some: clear errors, values in range."""
+"""Whether the leaves of a model and a state fit its scene, where a user has replaced some: clear errors."""
 
 from __future__ import annotations
 
-import functools
 import numbers
 from typing import Any
 
@@ -52,10 +51,6 @@ STATE: dict[str, tuple] = {
     "applied_torque": (BODY, 3),
 }
 """Shapes by the counts of the scene; a leaf that is None is absent."""
-LENGTHS = ("radius", "half_extents", "half_height")
-"""Parameters of shapes that are positive."""
-RESISTANCES = ("damping", "friction", "stiffness", "armature")
-"""Of joints: finite and not negative."""
 
 
 def check_leaves(label: str, model: Model, state: State) -> None:
@@ -109,31 +104,6 @@ def check_actions(label: str, model: Model, state: State, actions: Array | int) 
     if actions.ndim != 2 or actions.shape[1] != motor_count:
         raise ValueError(f"{label}: actions must have shape (steps, {motor_count}), got {actions.shape}")
     return actions
-
-
-def values_in_range(model: Model) -> Array:
-    """(world,) whether leaves of a worlds-last model are such as bodies, joints and motors have.
-
-    Not masses, moments of inertia, places and frames: motion with those is not finite.
-    """
-    fine = [jnp.isfinite(leaf) for parameters in model.shapes.values() for leaf in parameters.values()]
-    fine += [parameters[name] > 0 for parameters in model.shapes.values() for name in LENGTHS if name in parameters]
-    if model.scene.friction:
-        fine.append((model.friction >= 0) & jnp.isfinite(model.friction))
-    if model.scene.restitution:
-        fine.append((model.restitution >= 0) & (model.restitution <= 1))
-    if model.scene.slot_count:
-        fine += [jnp.isfinite(model.size), model.size > 0]
-    if model.scene.joints:
-        for name in RESISTANCES:
-            resistance = getattr(model, f"joint_{name}")
-            fine.append((resistance >= 0) & jnp.isfinite(resistance))
-        fine += [model.joint_limits[:, 0] <= model.joint_limits[:, 1], model.joint_swing >= 0]
-    if model.scene.motors:
-        bounds = (model.motor_limit, model.motor_cap, model.motor_stiffness, model.motor_damping)
-        fine += [bound >= 0 for bound in bounds]
-    each = [jnp.all(values.reshape(-1, values.shape[-1]), axis=0) for values in fine]
-    return functools.reduce(jnp.logical_and, each, jnp.ones(1, bool))
 
 
 def _check(label: str, name: str, leaf: Any, symbolic: tuple, scene: Scene) -> str | None:

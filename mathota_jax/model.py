@@ -19,7 +19,8 @@ class Model:
       dt: () time step [s].
       gravity: (3,) acceleration [m/s^2], world frame.
       mass: (body,) [kg]; 1 for static bodies (not used).
-      inertia: (body, 3) principal moments about the centre of mass [kg m^2].
+      inertia: (body, 3) principal moments about the centre of mass [kg m^2]. Where all moving bodies were built with three
+        equal ones (spheres, cubes) they must stay equal, for derivatives too: then nobody asks which axis they belong to.
       inertia_frame: (body, 4) principal axes in the body frame, quaternion; None where they are the axes of all bodies.
       size: (body,) characteristic length of the body [m] by which tolerances scale (its inner radius).
       friction: (body,) Coulomb coefficient; a pair uses the geometric mean.

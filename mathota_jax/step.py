@@ -20,7 +20,8 @@ from mathota_jax.constraints.problem import Forces, constrain, known_impulses, s
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
-from mathota_jax.leaf_shapes import check_actions, check_leaves, values_in_range
+from mathota_jax.leaf_shapes import check_actions, check_leaves
+from mathota_jax.leaf_values import values_in_range
 from mathota_jax.model import Model
 from mathota_jax.outcome import closing_force, end_forces, forces, new_state
 from mathota_jax.phases import (

@@ -254,7 +254,7 @@ def test_slides_by_friction_alone():
         changed = dataclasses.replace(model, friction=jnp.full_like(model.friction, friction))
         return rollout(changed, state, 20)[0].velocity[1, 0]
 
-    frictions = jnp.asarray([0.1, 0.2, 0.4])
+    frictions = jnp.asarray([0.05, 0.1, 0.2])
     seconds = 20 * float(model.dt)
     np.testing.assert_allclose(jax.vmap(slid)(frictions), 1.0 - frictions * 9.81 * seconds, atol=1e-4)
     slopes = jax.vmap(jax.grad(slid))(frictions)

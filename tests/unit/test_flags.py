@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import BallAndSocket, Flag, Hinge, SceneBuilder, Sphere, step
+from mathota_jax import BallAndSocket, Box, Flag, Heightfield, Hinge, SceneBuilder, Sphere, step
 from tests.scenes import advance_worlds, box_stack, repeat, sphere_on_plane
 
 WORLDS, BAD = 5, 2
@@ -87,6 +87,32 @@ def test_sizes_that_no_shape_has_are_flagged(value):
     wrong = dataclasses.replace(models, shapes=models.shapes | {"box": {"half_extents": half}})
     flags = np.asarray(advance_worlds(wrong, states, 1).flags)
     np.testing.assert_array_equal(flags & int(Flag.INVALID_PARAMETER) != 0, np.arange(WORLDS) == BAD)
+
+
+def test_moments_that_a_program_for_cubes_does_not_know_are_flagged():
+    """They were taken along the axes of the world."""
+    models, states = batch(SCENES["boxes"])
+    flags = np.asarray(advance_worlds(dataclasses.replace(models, inertia=2.0 * models.inertia), states, 1).flags)
+    assert not flags.any()
+    unequal = dataclasses.replace(models, inertia=models.inertia.at[BAD, 1, 0].multiply(1.5))
+    flags = np.asarray(advance_worlds(unequal, states, 1).flags)
+    np.testing.assert_array_equal(flags & int(Flag.INVALID_PARAMETER) != 0, np.arange(WORLDS) == BAD)
+
+
+def test_bodies_larger_than_what_is_searched_of_a_heightfield_are_flagged():
+    """A box made larger fell through a spike beside the cells that the built one could touch."""
+    builder = SceneBuilder()
+    builder.add_body(Heightfield(np.zeros((9, 9)), 0.1), static=True)
+    builder.add_body(Box((0.05, 0.1, 0.05)), mass=1.0, position=(0, 0.3, 0))
+    model, state = builder.build()
+    factors = jnp.asarray([1.0, 1.1, 5.0])
+
+    def flags(factor):
+        box = {"half_extents": model.shapes["box"]["half_extents"] * factor}
+        return step(dataclasses.replace(model, shapes=model.shapes | {"box": box}), state).flags
+
+    found = np.asarray(jax.jit(jax.vmap(flags))(factors))
+    np.testing.assert_array_equal(found & int(Flag.INVALID_PARAMETER) != 0, [False, False, True])
 
 
 RESISTANCES = ("joint_damping", "joint_friction", "joint_stiffness", "joint_armature")
