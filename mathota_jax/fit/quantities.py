@@ -81,9 +81,17 @@ def _write_mass(model: Model, state: State, index: int, value: Any) -> World:
     return _with(model, state, mass=model.mass.at[index].set(value), inertia=model.inertia.at[index].multiply(ratio))
 
 
+EQUAL = "all moving bodies were built with three equal moments of inertia, which the engine relies on"
+
+
+def _only_equal_moments(model: Model) -> bool:
+    scene = model.scene
+    return all(scene.spherical[body] for body in scene.dynamic_bodies)
+
+
 def _unequal_moments(model: Model, index: int) -> str | None:
-    if model.scene.spherical[index]:
-        return "the body was built with three equal moments, which the engine relies on; fit inertia_scale instead"
+    if _only_equal_moments(model):
+        return f"{EQUAL}; fit inertia_scale instead"
     return _static(model, index)
 
 
@@ -122,7 +130,12 @@ def _dimension(name: str) -> Quantity:
         return entries[0] if len(entries) == 1 and name in model.shapes[entries[0].kind] else None
 
     def missing(model: Model, index: int) -> str | None:
-        return None if entry(model, index) else f"the body is not one shape with a {name}; fit size instead"
+        found = entry(model, index)
+        if not found:
+            return f"the body is not one shape with a {name}; fit size instead"
+        if found.kind != "sphere" and not model.scene.static[index] and _only_equal_moments(model):
+            return f"{EQUAL}; build this one with sides that differ a little, or fit size instead"
+        return None
 
     def read(model: Model, state: State, index: int) -> Any:
         found = entry(model, index)
