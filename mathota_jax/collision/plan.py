@@ -49,6 +49,15 @@ class _Cell(NamedTuple):
     filter_class: int
 
 
+class _Bodies(NamedTuple):
+    """Moving bodies that take part: their number, most shapes on one; largest size of all over the smallest, large ones."""
+
+    count: int
+    most_shapes: int
+    size_ratio: float
+    large_count: int
+
+
 def plan_broadphase(
     entries: Sequence[ShapeEntry],
     static: Sequence[bool],
@@ -103,7 +112,9 @@ def plan_broadphase(
         shapes, pair_count, among = planes + shapes, with_planes, together
     capacity = _capacity(pair_count, moving, options)
     one_by_one = capacity <= ONE_BY_ONE_UP_TO
-    groups = _groups(among, ignored, sizes, capacity if one_by_one else None)
+    parts = collections.Counter(entries[k].body for k in shapes if not static[entries[k].body])
+    bodies = _Bodies(len(parts), max(parts.values()), max(sizes) / min(sizes), sum(r > 2.0 * min(sizes) for r in sizes))
+    groups = _groups(among, ignored, bodies, capacity, one_by_one)
     return Broadphase(method, tuple(shapes), tuple(sorted(excluded)), capacity, groups, one_by_one, ignored)
 
 
@@ -121,11 +132,11 @@ def _capacity(pair_count: int, moving: int, options: Options) -> int:
 
 
 def _groups(
-    cells: Mapping[_Cell, int], ignored: Filter, sizes: Sequence[float], capacity: int | None
+    cells: Mapping[_Cell, int], ignored: Filter, bodies: _Bodies, capacity: int, one_by_one: bool
 ) -> tuple[CompactGroup, ...]:
     """Groups by kinds and by the number of moving bodies, those with one first, as in `solver.table.make_tables`.
 
-    `capacity` is the number of pairs if each has a turn of its own, else None.
+    There is room for `capacity` pairs, each with a turn of its own if `one_by_one`.
     """
     kinds = list(dict.fromkeys(cell.kind for cell in cells))
     count: collections.Counter[tuple[str, bool]] = collections.Counter()
@@ -152,27 +163,29 @@ def _groups(
                     "bodies of one of them, or name both in ignore_collisions"
                 )
             if pairs:
-                tiers = (Tier(min(pairs, capacity), 1),) if capacity else _tiers(widest, partners, side_count, sizes)
+                room = min(pairs, capacity)
+                tiers = (Tier(room, 1),) if one_by_one else _tiers(widest, partners, side_count, bodies, room)
                 groups.append(CompactGroup(a, b, PAIRS[a, b].point_count, side_count, tiers))
     return tuple(groups)
 
 
-def _tiers(widest: int, partners: int, side_count: int, sizes: Sequence[float]) -> tuple[Tier, ...]:
+def _tiers(widest: int, partners: int, side_count: int, bodies: _Bodies, room: int) -> tuple[Tier, ...]:
     """Turns for a graph of contacts in which a body has a bounded number of neighbours.
 
     A turn is a set of pairs without a common body, so it needs no more columns than half the bodies, or all of them where
     the partners are static. A greedy colouring of a graph of greatest degree d takes few more than d turns, at most
-    2 d - 1; a body of size R has at most about 4 (1 + R / r)^2 neighbours of size r (area of the sphere of their centers).
+    2 d - 1; a shape of size R has at most about 4 (1 + R / r)^2 neighbours of size r (area of the sphere of their centers),
+    and a body as many for each of its shapes. There are at most as many turns as `room` for pairs.
     """
-    packing = 4.0 * (1.0 + max(sizes) / min(sizes)) ** 2
-    degree = min(partners, math.ceil(packing))
-    turns = degree if side_count == 1 else min(2 * degree - 1, degree + 8)
+    packing = 4.0 * (1.0 + bodies.size_ratio) ** 2
+    degree = min(partners, math.ceil(packing)) * bodies.most_shapes
+    turns = min(room, degree if side_count == 1 else min(2 * degree - 1, degree + 8))
+    widest = min(widest, bodies.count)
     tiers = [Tier(min(turns, FULL_TURNS), widest)]
     turns -= tiers[0].turn_count
     if turns > 0:
         tiers.append(Tier(min(turns, FULL_TURNS), max(widest // 4, min(widest, 4))))
         turns -= tiers[1].turn_count
-    large = sum(size > 2.0 * min(sizes) for size in sizes)
     if turns > 0:
-        tiers.append(Tier(turns, max(1, min(large, widest // 4))))
+        tiers.append(Tier(turns, max(1, min(bodies.large_count, widest // 4))))
     return tuple(tiers)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Capsule, Compound, Plane, SceneBuilder, Sphere, step
+from mathota_jax import Box, Capsule, Compound, Plane, SceneBuilder, Sphere, rollout, step
 from mathota_jax.collision.broadphase import BROADPHASES, Admissible, Bounds, Planes, candidate_pairs
 from mathota_jax.collision.broadphase.choice import choose_method
 from mathota_jax.pair_filter import make_filter
@@ -366,3 +366,29 @@ def test_all_shapes_of_a_kind_on_one_body(part, static):
     model, state = builder.build()
     assert model.scene.broadphase is not None
     assert jax.eval_shape(lambda s: step(model, s), state).position.shape == (10, 3)
+
+
+def balls_on_boxes():
+    """Forty balls of one body on forty boxes of another: one pair shares the moving body with all others."""
+    places = [(0.25 * i, 0.0, 0.5 * j) for i in range(-10, 10) for j in (-1, 1)]
+    builder = SceneBuilder()
+    boxes = Compound([(Box((0.12, 0.1, 0.12)), (place, (1, 0, 0, 0))) for place in places])
+    balls = Compound([(Sphere(0.1), (place, (1, 0, 0, 0))) for place in places])
+    builder.add_body(boxes, static=True, position=(0, -0.1, 0))
+    builder.add_body(balls, mass=5.0, position=(0, 0.1, 0))
+    return builder.build()
+
+
+def test_a_body_of_many_shapes_has_turns_for_all_its_contacts():
+    broadphase = balls_on_boxes()[0].scene.broadphase
+    assert broadphase is not None and not broadphase.one_by_one
+    (group,) = (group for group in broadphase.groups if group.kind_a != group.kind_b)
+    assert 40 <= sum(tier.turn_count for tier in group.tiers) <= broadphase.capacity
+
+
+@pytest.mark.slow
+def test_a_body_of_many_shapes_stands_on_all_of_them():
+    model, state = balls_on_boxes()
+    final = rollout(model, state, 60)[0]
+    assert not int(final.flags)
+    np.testing.assert_allclose(final.position[1], state.position[1], atol=1e-5)
