@@ -18,6 +18,7 @@ from mathota_jax.constraints.mechanism_layout import (
     takes_contacts,
     takes_small_steps,
 )
+from mathota_jax.constraints.warm_start import matches_by_distance
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 
@@ -133,7 +134,9 @@ def _state_bytes(model: Model) -> int:
     scene = model.scene
     number = model.dt.dtype.itemsize
     forces = 3 * scene.slot_count + joint_row_count(scene)
-    floats = scene.body_count * FLOATS_OF_A_BODY + forces * (2 if takes_small_steps(scene) else 1)
+    end_forces = forces + 1 if takes_small_steps(scene) else 0
+    contact_offset = 3 * scene.slot_count if matches_by_distance(scene) else 0
+    floats = scene.body_count * FLOATS_OF_A_BODY + forces + end_forces + contact_offset
     integers = scene.slot_count + 1 + scene.place_count
     sleep = scene.body_count * (8 * number + 1) if scene.options.sleep else 0
     return floats * number + integers * 4 + sleep

@@ -41,7 +41,8 @@ class Flag(enum.IntFlag):
     """A leaf of the model is not finite or out of range: a negative friction, a restitution beyond 0 to 1, a length of a
     shape that is not positive, a negative damping, stiffness or armature of a joint, limits of a joint the wrong way round,
     a negative limit, cap or gain of a motor; or the scene was built without it: unequal moments of inertia where all moving
-    bodies had equal ones, a body so large that more cells of a heightfield are below it than are searched. (A mass or a moment of inertia that is not positive makes the motion NaN.)"""
+    bodies had equal ones, a body so large that more cells of a heightfield are below it than are searched. (A mass or a
+    moment of inertia that is not positive makes the motion NaN.)"""
 
     DEEP_OVERLAP = 128
     """At the start of a step two bodies overlapped by more than half of the inner radius of the smaller one: the solver can

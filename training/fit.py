@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import json
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import numpy as np
 from mathota_jax import Options, SceneBuilder
 from mathota_jax.fit import FitResult, Noise, Parameter, fit, load
 from training.requirements import require_packages
+from training.run_folder import make_folder
 
 DEFAULT_FUNCTION = "build_scene"
 
@@ -62,14 +64,17 @@ def load_scene(text: str) -> SceneBuilder:
     """The builder that a function of a file or module returns.
 
     Raises:
-        ValueError: there is no such file, module or function, or it returns something else.
+        ValueError: there is no such file, module or function, it fails, or it returns something else.
     """
     source, _, name = text.rpartition(":") if not text.endswith(".py") and ":" in text else (text, "", "")
     name = name or DEFAULT_FUNCTION
     function = getattr(_module(source), name, None)
     if not callable(function):
         raise ValueError(f"--scene {text}: {source} has no function {name}()")
-    builder = function()
+    try:
+        builder = function()
+    except Exception as error:  # whatever a user's function raises
+        raise ValueError(f"--scene {text}: {name}() failed{_failure(error)}") from error
     if not isinstance(builder, SceneBuilder):
         raise ValueError(f"--scene {text}: {name}() must return a SceneBuilder, got {type(builder).__name__}")
     return builder
@@ -89,8 +94,19 @@ def _module(source: str) -> Any:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever a user's file raises
+        raise ValueError(f"--scene: {source} can not be loaded{_failure(error)}") from error
     return module
+
+
+def _failure(error: Exception) -> str:
+    """Where and why the user's code failed: the innermost line of the file in which it began."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__)[1:] if "importlib" not in frame.filename]
+    own = [frame for frame in frames if frame.filename == frames[0].filename]
+    place = f" in line {own[-1].lineno} of {own[-1].filename}" if own else ""
+    return f"{place}: {type(error).__name__}: {error}"
 
 
 def _run(options: argparse.Namespace) -> FitResult:
@@ -98,6 +114,8 @@ def _run(options: argparse.Namespace) -> FitResult:
 
     builder = load_scene(options.scene)
     data = load(options.data)
+    optimiser = _optimiser(options)
+    make_folder(options.output)
     model, state = builder.build(Options(linear_damping=options.damping, angular_damping=options.damping))
     with _progress(options.steps, options.quiet) as progress:
         result = fit(
@@ -113,7 +131,7 @@ def _run(options: argparse.Namespace) -> FitResult:
             huber=options.huber,
             start_count=options.starts,
             seed=options.seed,
-            optimiser=_optimiser(options),
+            optimiser=optimiser,
             step_limit=options.steps,
             progress=progress,
         )
@@ -141,6 +159,8 @@ def summary(result: FitResult) -> dict[str, Any]:
 
 
 def _optimiser(options: argparse.Namespace) -> Any:
+    if not (options.learning_rate > 0 and np.isfinite(options.learning_rate)):
+        raise ValueError(f"--learning-rate must be a positive number, got {options.learning_rate}")
     if options.method == "lm":
         return None
     import optax

@@ -1,5 +1,6 @@
 """Where a training run writes its results."""
 
+import tempfile
 import time
 from pathlib import Path
 
@@ -17,22 +18,43 @@ def create_run_folder(environment_id: str, backend: str, output: Path | None = N
         output: The folder to use instead; it may exist but must not hold an earlier run.
 
     Raises:
-        ValueError: If ``output`` holds a run already, or cannot be a folder.
+        ValueError: If ``output`` holds a run already, or the folder cannot be made or written to.
     """
     if output is not None:
-        if output.exists() and not output.is_dir():
-            raise ValueError(f"--output {output} is not a folder; give another")
         if (output / METRICS_FILE).exists():
             raise ValueError(f"--output {output} holds an earlier run; give another folder or remove that one")
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
         return output
     base = f"{environment_id.rpartition('/')[2]}-{backend}-{time.strftime('%Y%m%d-%H%M%S')}"
     attempt = 1
     while True:
         folder = Path("runs") / (base if attempt == 1 else f"{base}-{attempt}")
         try:
-            folder.mkdir(parents=True)
+            make_folder(folder, exist_ok=False)
         except FileExistsError:
             attempt += 1
         else:
             return folder
+
+
+def make_folder(folder: Path, exist_ok: bool = True) -> None:
+    """Make a folder that can be written to: what takes hours must not be lost at its end.
+
+    Args:
+        folder: The folder; those above it are made too.
+        exist_ok: Whether it may exist.
+
+    Raises:
+        ValueError: If it is no folder, or cannot be made or written to.
+        FileExistsError: If it exists and must not.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--output {folder} is not a folder; give another")
+    try:
+        folder.mkdir(parents=True, exist_ok=exist_ok)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        if isinstance(error, FileExistsError) and not exist_ok:
+            raise
+        raise ValueError(f"--output {folder}: nothing can be written there ({error}); give another") from error

@@ -85,7 +85,9 @@ class ShortHorizonActorCritic(BlockOfUpdates):
 
     def __init__(self, environment: Any, hyperparameters: ShortHorizonHyperparameters) -> None:
         super().__init__()
-        self.environment = BoundedSensitivity(environment, hyperparameters.maximum_state_norm)
+        # The loss is the mean over these steps: what one world passes back is so much smaller than of its own return.
+        step_count = hyperparameters.worlds * hyperparameters.rollout_length
+        self.environment = BoundedSensitivity(environment, hyperparameters.maximum_state_norm / step_count)
         self.hyperparameters = hyperparameters
         self.bounds = ActionBounds.of(environment.action_space)
         self.observation_size = int(np.prod(environment.observation_space.shape))

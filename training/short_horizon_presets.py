@@ -22,8 +22,9 @@ class ShortHorizonHyperparameters:
         critic_epochs: Passes of the critic over the samples of an update.
         minibatch_count: Minibatches that one pass is cut into.
         maximum_gradient_norm: Gradients of actor and critic are scaled down to this norm.
-        maximum_state_norm: Bound, for each world and control step, on the cotangent of the state (`clip_cotangent`), for
-            rewards in units of 1 / (1 - discount).
+        maximum_state_norm: Bound, for each world and control step, on the gradient of this world's discounted return by
+            the state (`clip_cotangent`), where a reward of 1 for ever is worth 1. Whatever the number of worlds and the
+            horizon. The default is meant for gradients that explode.
         hidden_sizes: Widths of the hidden layers, for the actor and for the critic.
         initial_log_standard_deviation: Of the exploration noise, in units of the bounds of the actions.
         evaluations: Number of evaluations during training, evenly spread.
@@ -40,7 +41,7 @@ class ShortHorizonHyperparameters:
     critic_epochs: int = 8
     minibatch_count: int = 4
     maximum_gradient_norm: float = 1.0
-    maximum_state_norm: float = 10.0
+    maximum_state_norm: float = 1e4
     hidden_sizes: tuple[int, ...] = (64, 64)
     initial_log_standard_deviation: float = -1.0
     evaluations: int = 10

@@ -59,8 +59,9 @@ def nearest_wall(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, s
     nearest, lowest = pick(point, number), point.map(lambda c: c[-1])
     way = jnp.maximum(-gap, 0.0)
     fall = depth_under(window, lowest)
-    if SUPPORT[kind].inflation is not None:
-        way, fall = jnp.maximum(SUPPORT[kind].inflation(known) - gap, 0.0), fall + SUPPORT[kind].inflation(known)
+    inflation = SUPPORT[kind].inflation
+    if inflation is not None:
+        way, fall = jnp.maximum(inflation(known) - gap, 0.0), fall + inflation(known)
     step = LEVEL * size
     code = jnp.where(jnp.abs(fall) <= step, 1.0, 0.0)
     code = jnp.where((fall > step) & (fall > way) & (depth_under(window, nearest) > 0), 2.0, code)

@@ -244,7 +244,8 @@ def _meets_too(model: Model, found: tuple[Bodies, Array, Array]) -> Array:
     bodies, gap, rate = found
     sides = model.scene.slot_bodies
     size = smaller_moving(model, *sides)
-    scale = sum(take(norm(bodies.velocity), side) for side in sides)
+    speed = norm(bodies.velocity)
+    scale = take(speed, sides[0]) + take(speed, sides[1])
     rests = -rate <= rest_speed(norm(Vec3(*(model.gravity[axis][None] for axis in range(3)))), model.dt, size, scale)
     return (gap <= 4.0 * tolerance(gap.dtype) * size) & ~rests
 

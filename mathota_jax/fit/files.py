@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import zipfile
+from collections.abc import Iterable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,10 @@ COLUMNS = {
 """Columns of a CSV file for each channel."""
 
 GRID_TOLERANCE = 0.01
-"""How far a time may be from a whole number of frames, in frames."""
+"""How far a time may be from a whole number of frames, in frames, beside what the decimals it is written with leave open."""
+
+UNAMBIGUOUS = 0.3
+"""Unit of the last decimal, in frames, up to which times may be rounded: to coarser ones several spacings would fit."""
 
 SPARSEST = 1000
 """Frames for each line of a CSV file; more come from two times that are nearly equal."""
@@ -55,7 +60,10 @@ def load_npz(path: str | Path) -> Trajectories:
         ValueError: the file is no NPZ archive, lacks a key or has one too many, or its arrays are not valid.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("one array alone, as numpy.save writes it; use numpy.savez")
+        with archive:
             content = {key: archive[key] for key in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
         raise ValueError(f"{path}: not an NPZ file of plain arrays ({error})") from error
@@ -66,7 +74,10 @@ def load_npz(path: str | Path) -> Trajectories:
     for key in content:
         if key not in known:
             raise ValueError(f"{path}: unknown key '{key}'; known: {', '.join(known)}")
-    bodies = tuple(str(name) for name in np.atleast_1d(content.pop("bodies")))
+    bodies = np.atleast_1d(content.pop("bodies"))
+    if bodies.dtype.kind not in "US":
+        raise ValueError(f"{path}: bodies must be names, got {bodies.tolist()}")
+    bodies = tuple(np.char.decode(bodies, "utf-8").tolist() if bodies.dtype.kind == "S" else bodies.tolist())
     dt = content.pop("dt")
     if content["position"].ndim == 3:
         content = {key: value[None] for key, value in content.items()}
@@ -90,7 +101,9 @@ def load_csv(path: str | Path) -> Trajectories:
     Columns, in any order: `trajectory` (a whole number or name; may be left out for one trajectory), `time` [s], `body`
     (a name) and the channels ``x,y,z``, ``qw,qx,qy,qz``, ``vx,vy,vz``, ``wx,wy,wz``, of which those of a channel stand or
     fall together and the position is needed. Empty cells and missing lines are missing frames. The times of each trajectory
-    lie on a grid of constant spacing that starts with its first line; the spacing is the smallest difference of times.
+    lie on a grid of constant spacing that starts with its first line; the smallest difference of times is one frame. They
+    may be rounded to the decimals they are written with as long as the frames can be counted, as milliseconds can up to
+    300 frames a second; the spacing is the one that fits all of them best.
 
     Raises:
         ValueError: unknown or missing columns, a cell that is no number, times off the grid, a frame given twice, or
@@ -103,25 +116,26 @@ def load_csv(path: str | Path) -> Trajectories:
     names = [row.get("trajectory", "0").strip() for _, row in rows]
     bodies = tuple(dict.fromkeys(row["body"].strip() for _, row in rows))
     order = list(dict.fromkeys(names))
-    begin = {name: min(t for t, n in zip(times, names, strict=True) if n == name) for name in order}
-    dt = _spacing(path, times, names)
-    frames = [(t - begin[name]) / dt for t, name in zip(times, names, strict=True)]
-    for frame, (line, _) in zip(frames, rows, strict=True):
-        if abs(frame - round(frame)) > GRID_TOLERANCE:
-            raise ValueError(
-                f"{path}, line {line}: the time is {frame * dt:g} s after the start of its trajectory, no whole number of "
-                f"frames of {dt:g} s, which fit all times best; times must lie on a grid of constant spacing"
-            )
+    dt, frames, off = _grid(path, times, names)
     if max(frames) > SPARSEST * len(rows):
         raise ValueError(
-            f"{path}: with frames of {dt:g} s, the smallest difference of times, there are {max(frames):.3g} frames for "
-            f"{len(rows)} lines; times that are meant to be one must be equal"
+            f"{path}: with frames of {dt:g} s, the smallest difference of times, there are "
+            f"{float(max(frames)):.3g} frames for {len(rows)} lines; times that are meant to be one must be equal"
         )
-    shape = (len(order), round(max(frames)) + 1, len(bodies))
+    # Each of two rounded times may be half a unit of the last place off the grid.
+    rounding = _last_place(row["time"] for _, row in rows) / dt
+    allowed = GRID_TOLERANCE + (rounding if rounding <= UNAMBIGUOUS else 0.0)
+    for way, time, (line, _) in zip(off, times, rows, strict=True):
+        if abs(way) > allowed:
+            raise ValueError(
+                f"{path}, line {line}: the time is {time:g} s, {abs(way):.2g} frames off the grid of frames of {dt:g} s "
+                f"that fits all times best, more than {allowed:.2g}; times must lie on a grid of constant spacing"
+            )
+    shape = (len(order), max(frames) + 1, len(bodies))
     arrays = {channel: np.full((*shape, CHANNELS[channel]), np.nan) for channel in channels}
     seen: dict[tuple[int, int, int], int] = {}
     for frame, name, (line, row) in zip(frames, names, rows, strict=True):
-        place = (order.index(name), round(frame), bodies.index(row["body"].strip()))
+        place = (order.index(name), frame, bodies.index(row["body"].strip()))
         if place in seen:
             raise ValueError(f"{path}, line {line}: body '{row['body']}' has this frame in line {seen[place]} already")
         seen[place] = line
@@ -185,13 +199,57 @@ def _number(path: str | Path, line: int, column: str, cell: str) -> float:
         raise ValueError(f"{path}, line {line}: '{text}' in column '{column}' is not a number") from error
 
 
-def _spacing(path: str | Path, times: list[float], names: list[str]) -> float:
-    """Time between two frames [s]: the smallest difference, made exact by all others, which are multiples of it."""
-    differences = []
-    for name in set(names):
-        own = np.unique([t for t, n in zip(times, names, strict=True) if n == name])
-        differences += list(np.diff(own))
-    if not differences:
+def _last_place(cells: Iterable[str]) -> float:
+    """The unit of the last decimal with which numbers are written, of the most precise one: 0.001 of "0.5" and "0.533"."""
+    return 10.0 ** min(int(Decimal(cell.strip()).as_tuple().exponent) for cell in cells)
+
+
+def _grid(path: str | Path, times: list[float], names: list[str]) -> tuple[float, list[int], np.ndarray]:
+    """The grid of constant spacing that fits all times best by least squares.
+
+    Args:
+        path: for messages.
+        times: (line,) [s].
+        names: (line,) of the trajectories, each with a grid of its own beginning.
+
+    Returns:
+        Time between two frames [s]; frame of each line; how far its time is from that frame, in frames.
+    """
+    trajectory = np.unique(names, return_inverse=True)[1]
+    points, place = np.unique(np.stack([trajectory, times], 1), axis=0, return_inverse=True)
+    place = place.ravel()
+    time, steps, within = points[:, 1], np.diff(points[:, 1]), np.diff(points[:, 0]) == 0
+    if not within.any():
         raise ValueError(f"{path}: each trajectory needs at least 2 frames")
-    counts = np.round(np.asarray(differences) / min(differences))
-    return float(np.sum(differences) / np.sum(counts))
+    spans = np.ones(len(steps), int)
+    known = within & (steps < 1.5 * steps[within].min())
+    while True:
+        dt, frame, off, duration = _spacing(time, spans, known)
+        unknown = within & ~known
+        if not unknown.any():
+            return dt, frame[place].tolist(), off[place]
+        # A gap is counted once the spacing is known from frames over as long a time.
+        new = unknown & (steps <= max(duration, steps[unknown].min()))
+        spans[new] = np.round(steps[new] / dt)
+        known |= new
+
+
+def _spacing(time: np.ndarray, spans: np.ndarray, known: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, float]:
+    """Least squares of one spacing and the beginnings of all chains of times.
+
+    Args:
+        time: (n,) [s], rising within a chain.
+        spans: (n - 1,) frames between one time and the next.
+        known: (n - 1,) whether they are known; where not, a chain ends.
+
+    Returns:
+        Spacing [s]; (n,) frame in the chain; (n,) how far each time is from that, in frames; duration of the longest [s].
+    """
+    chain = np.concatenate([[0], np.cumsum(~known)])
+    first = np.flatnonzero(np.diff(chain, prepend=-1))
+    frame = np.concatenate([[0], np.cumsum(spans)])
+    frame = frame - frame[first][chain]
+    since = time - time[first][chain]
+    t, k = (values - (np.bincount(chain, values) / np.bincount(chain))[chain] for values in (since, frame))
+    dt = float(t @ k / (k @ k))
+    return dt, frame, t / dt - k, float(since.max())

@@ -13,7 +13,7 @@ import numpy as np
 
 from mathota_jax.fit.initial_states import Motion
 from mathota_jax.fit.least_squares import Progress, Solution, Stage, levenberg_marquardt
-from mathota_jax.fit.normal_equations import Weights, normal_equations, robust_factor, stack_starts
+from mathota_jax.fit.normal_equations import Weights, stack_starts
 from mathota_jax.fit.objective import Noise, Objective, Spread
 from mathota_jax.fit.optimise import optimise, require_optax
 from mathota_jax.fit.parameters import Parameter, parameter_vector
@@ -68,7 +68,8 @@ def fit(
         segments: of multiple shooting (H. Bock and K. Plitt, 1984). Trajectories are cut into as many pieces, whose
             beginnings are unknowns, tied together ever tighter: long or chaotic motions then converge from far starts.
         horizons: increasing shares of the frames to fit, one after the other, the last one 1: short motions first.
-        huber: residuals beyond this many standard deviations count linearly instead of squared; None for none.
+        huber: residuals beyond this many standard deviations count linearly instead of squared; None for none. Intervals
+            allow for it, see `residual_scale`.
         start_count: number of starts; those after the first are random (see `ParameterVector.random_starts`). They run
             side by side under `jax.vmap`, and the best is the result.
         seed: of the random starts.
@@ -212,26 +213,22 @@ def _result(
 ) -> FitResult:
     vector, data = objective.vector, objective.data
     best = int(np.argmin(solution.cost))
-    unbounded, charts = solution.unbounded[best], solution.charts[best]
+    ends, charts = vector.off_bounds(solution.unbounded), solution.charts[best]
+    unbounded = ends[best]
     # All starts once more: the program for their number is compiled already.
-    found = stack_starts(objective.linearise(solution.unbounded, solution.charts), best)
-    equations = normal_equations(found, weights, free)
-    residual = np.asarray(found.residual, float)
-    square_sum = float(np.sum((robust_factor(residual, weights) * residual) ** 2))
+    found = stack_starts(objective.linearise(ends, solution.charts), best)
     # Each segment after the first has as many ties as unknowns.
     start_unknowns = data.count * objective.chart_size if objective.start == "free" else 0
-    found_out = uncertainty(
-        vector, unbounded, equations, square_sum, int(objective.mask.sum()), start_unknowns, confidence
-    )
+    found_out = uncertainty(vector, unbounded, found, weights, free, objective.pulls, start_unknowns, confidence)
     warnings = list(found_out.warnings)
     if not solution.converged[best]:
         warnings.append(
             f"Not converged after {solution.steps} steps: raise the limit, or start closer where no step lowers the cost."
         )
     warnings += [
-        f"The {leaf.replace('_', ' ')} of '{body}', which was not recorded, begins up to {away:.2g} spreads off the scene: "
+        f"The {what} of '{body}', which was not recorded, begins up to {away:.2g} spreads off the scene: "
         "give a wider one (`spread`) if the scene's may be that wrong."
-        for (body, leaf), away in objective.pulled(charts).items()
+        for (body, what), away in objective.pulled(charts).items()
         if away > FAR
     ]
     near = solution.cost <= solution.cost[best] * 1.01 + 1e-12
@@ -260,7 +257,7 @@ def _result(
         model=model,
         state=state,
         initial=_initial(objective, unbounded, charts),
-        residuals=objective.by_channel(residual),
+        residuals=objective.by_channel(np.asarray(found.residual, float)),
         data=data,
     )
 

@@ -84,13 +84,14 @@ def difference(first: Motion, second: Motion, moving: tuple[int, ...]) -> Array:
 def guesses(
     model: Model, state: State, data: Trajectories, frames: list[int], recorded: bool
 ) -> tuple[Motion, np.ndarray]:
-    """Motions of all bodies at some frames of each trajectory, and which of their leaves the data tell.
+    """Motions of all bodies at some frames of each trajectory, and which components of their leaves the data tell.
 
-    The motions have leaves (trajectory, frame, body, ...), NumPy float64; what is told (trajectory, frame, body, leaf).
+    The motions have leaves (trajectory, frame, body, ...), NumPy float64; what is told is (trajectory, frame, body, leaf,
+    3), for an orientation all three or none.
 
     Positions and orientations are those recorded at the frame, or the nearest recorded ones moved along by the velocity;
-    velocities are recorded ones, or the slope over the nearest frames. Bodies and channels that were not recorded keep
-    the state of the scene.
+    velocities are recorded ones, or the slope over the nearest frames; each component of a vector by itself. Bodies,
+    channels and components that were not recorded keep the state of the scene.
 
     Args:
         model: the scene.
@@ -107,16 +108,16 @@ def guesses(
     names = model.scene.body_names
     outer = (data.count, len(frames))
     motion = [np.broadcast_to(np.asarray(leaf, float), (*outer, *leaf.shape)).copy() for leaf in motion_of(state)]
-    told = np.zeros((*outer, len(names), len(motion)), bool)
+    told = np.zeros((*outer, len(names), len(motion), 3), bool)
     for column, body in enumerate(data.bodies):
         index = names.index(body)
         for trajectory in range(data.count):
             for place, frame in enumerate(frames):
                 found = _guess(data, trajectory, column, frame)
-                told[trajectory, place, index] = [value is not None for value in found]
+                told[trajectory, place, index] = [~np.isnan(value[:3]) for value in found]
                 for leaf, value in zip(motion, found, strict=True):
-                    if value is not None:
-                        leaf[trajectory, place, index] = value
+                    own = leaf[trajectory, place, index]
+                    own[:] = np.where(np.isnan(value), own, value)
     return Motion(*motion), told
 
 
@@ -134,57 +135,51 @@ def _check_recorded(data: Trajectories) -> None:
             )
 
 
-def _guess(data: Trajectories, trajectory: int, body: int, frame: int) -> list[np.ndarray | None]:
-    position, velocity = _linear(data, "position", "velocity", trajectory, body, frame)
-    if data.orientation is None:
-        return [position, None, velocity, _at(data.angular_velocity, trajectory, body, frame)]
+def _guess(data: Trajectories, trajectory: int, body: int, frame: int) -> list[np.ndarray]:
+    """Leaves of the motion of one body; NaN where nothing was recorded."""
+    rates = _at(data.velocity, trajectory, body, frame)
+    position, velocity = np.transpose(
+        [_coordinate(data.position[trajectory, :, body, k], rates[k], frame, data.dt) for k in range(3)]
+    )
     orientation, angular_velocity = _rotation(data, trajectory, body, frame)
     return [position, orientation, velocity, angular_velocity]
 
 
-def _at(channel: np.ndarray | None, trajectory: int, body: int, frame: int) -> np.ndarray | None:
-    if channel is None or np.isnan(channel[trajectory, frame, body]).any():
-        return None
-    return channel[trajectory, frame, body]
+def _at(channel: np.ndarray | None, trajectory: int, body: int, frame: int) -> np.ndarray:
+    return np.full(3, np.nan) if channel is None else channel[trajectory, frame, body]
 
 
-def _nearest(channel: np.ndarray, frame: int) -> np.ndarray:
-    """The complete frames nearest to a frame, in order of time."""
-    complete = np.flatnonzero(~np.isnan(channel).any(-1))
-    return np.sort(complete[np.argsort(np.abs(complete - frame), kind="stable")[:WINDOW]])
+def _nearest(recorded: np.ndarray, frame: int) -> np.ndarray:
+    """The recorded frames nearest to a frame, in order of time."""
+    known = np.flatnonzero(recorded)
+    return np.sort(known[np.argsort(np.abs(known - frame), kind="stable")[:WINDOW]])
 
 
-def _linear(
-    data: Trajectories, value: str, rate: str, trajectory: int, body: int, frame: int
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    channel = getattr(data, value)[trajectory, :, body]
-    near = _nearest(channel, frame)
-    slope = _at(getattr(data, rate), trajectory, body, frame)
+def _coordinate(values: np.ndarray, rate: float, frame: int, dt: float) -> tuple[float, float]:
+    """Value and rate at a frame of one coordinate (frame,) of a position; `rate` is the recorded one."""
+    near = _nearest(~np.isnan(values), frame)
     if len(near) == 0:
-        return None, slope
+        return np.nan, rate
     closest = near[np.argmin(np.abs(near - frame))]
-    if slope is None and len(near) > 1:
-        time = (near - near.mean()) * data.dt
-        slope = time @ channel[near] / (time @ time)
-    moved = channel[closest] + (0.0 if slope is None else slope * (frame - closest) * data.dt)
-    return moved, slope
+    if np.isnan(rate) and len(near) > 1:
+        time = (near - near.mean()) * dt
+        rate = time @ values[near] / (time @ time)
+    return values[closest] + np.nan_to_num(rate) * (frame - closest) * dt, rate
 
 
-def _rotation(
-    data: Trajectories, trajectory: int, body: int, frame: int
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    assert data.orientation is not None
-    channel = data.orientation[trajectory, :, body]
-    near = _nearest(channel, frame)
+def _rotation(data: Trajectories, trajectory: int, body: int, frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """Orientation and angular velocity at a frame."""
     rate = _at(data.angular_velocity, trajectory, body, frame)
+    if data.orientation is None:
+        return np.full(4, np.nan), rate
+    values = data.orientation[trajectory, :, body]
+    near = _nearest(~np.isnan(values[:, 0]), frame)
     if len(near) == 0:
-        return None, rate
-    turns = Rotation.from_quat(channel[near][:, [1, 2, 3, 0]])
+        return np.full(4, np.nan), rate
+    turns = Rotation.from_quat(values[near][:, [1, 2, 3, 0]])
     closest = int(np.argmin(np.abs(near - frame)))
-    if rate is None and len(near) > 1:
+    if np.isnan(rate).any() and len(near) > 1:
         steps = (turns[1:] * turns[:-1].inv()).as_rotvec() / (np.diff(near)[:, None] * data.dt)
-        rate = steps.mean(0)
-    moved = turns[closest]
-    if rate is not None:
-        moved = Rotation.from_rotvec(rate * (frame - near[closest]) * data.dt) * moved
+        rate = np.where(np.isnan(rate), steps.mean(0), rate)
+    moved = Rotation.from_rotvec(np.nan_to_num(rate) * (frame - near[closest]) * data.dt) * turns[closest]
     return moved.as_quat()[[3, 0, 1, 2]], rate

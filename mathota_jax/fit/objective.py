@@ -160,8 +160,8 @@ def cut(model: Model, state: State, data: Trajectories, segment_count: int, star
     if start == "free":
         widths = np.array([getattr(spread, leaf) for leaf in Motion._fields])
         loose = [body not in model.scene.jointed for body in model.scene.dynamic_bodies]
-        unknown = ~told[:, 0, list(model.scene.dynamic_bodies)] & np.array(loose, bool)[:, None]
-        pull[:, 0] = np.where(unknown, 1.0 / widths, 0.0)[..., None]
+        unknown = ~told[:, 0, list(model.scene.dynamic_bodies)] & np.array(loose, bool)[:, None, None]
+        pull[:, 0] = np.where(unknown, 1.0 / widths[:, None], 0.0)
     return Segments(motions, observed, action, pull.reshape(data.count, segment_count, -1), frames)
 
 
@@ -227,6 +227,12 @@ class Objective:
         return np.concatenate(parts, -1)
 
     @property
+    def pulls(self) -> np.ndarray:
+        """(residual,) which of them pull beginnings towards the scene: the last ones."""
+        count = self.segments.pull.shape[-1]
+        return np.arange(self.mask.shape[-1]) >= self.mask.shape[-1] - count
+
+    @property
     def frame_of_residual(self) -> np.ndarray:
         """(segment, residual) the frame that each residual belongs to."""
         parts = []
@@ -256,14 +262,18 @@ class Objective:
         return found
 
     def pulled(self, charts: np.ndarray) -> dict[tuple[str, str], float]:
-        """How far beginnings (n, s, chart) lie off the scene in what was not recorded: (body, leaf) -> largest [spread]."""
-        away = np.abs(self.segments.pull[:, 0] * charts[:, 0]).reshape(len(charts), len(self.moving), -1, 3).max((0, 3))
-        names = self.model.scene.body_names
-        return {
-            (names[body], leaf): float(away[place, number])
-            for place, body in enumerate(self.moving)
-            for number, leaf in enumerate(Motion._fields)
-        }
+        """How far beginnings (n, s, chart) lie off the scene in what was not recorded: (body, what) -> largest [spread]."""
+        shape = (len(charts), len(self.moving), len(Motion._fields), 3)
+        shape = (len(charts), len(self.moving), len(Motion._fields), 3)
+        away = np.abs(self.segments.pull[:, 0] * charts[:, 0]).reshape(shape).max((0, 3))
+        held = np.asarray((self.segments.pull[:, 0] > 0).reshape(shape).any(0)).tolist()
+        found = {}
+        for place, body in enumerate(self.moving):
+            for number, leaf in enumerate(Motion._fields):
+                axes = [axis for axis, part in zip("xyz", held[place][number], strict=True) if part]
+                what = leaf.replace("_", " ") + (f" ({', '.join(axes)})" if 0 < len(axes) < 3 else "")
+                found[self.model.scene.body_names[body], what] = float(away[place, number])
+        return found
 
     @property
     def start_arrays(self) -> Motion:

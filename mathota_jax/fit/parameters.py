@@ -20,6 +20,8 @@ from mathota_jax.state import State
 NAME = re.compile(r"(\w+)(?:\[(.+)\])?")
 SPREAD = 0.5
 """Standard deviation of random starts along an unbounded number, when no two bounds say where to look."""
+FLAT = 20.0
+"""How far unbounded numbers go towards a bound: to 2e-9 of the range, or of the start. Beyond, transforms are flat."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,6 +104,17 @@ class ParameterVector(NamedTuple):
             for quantity, index in place.targets:
                 model, state = quantity.write(model, state, index, value)
         return model, state
+
+    def off_bounds(self, unbounded: np.ndarray) -> np.ndarray:
+        """(..., entry) the same values, with numbers that ran away towards a bound brought back to where slopes are left."""
+        found = unbounded.copy()
+        for place in self.places:
+            part = found[..., place.begin : place.end]
+            if place.transform.name == "logit":
+                np.clip(part, -FLAT, FLAT, out=part)
+            elif place.transform.name != "identity":
+                np.maximum(part, np.minimum(np.ravel(place.transform.to_unbounded(place.start)), 0.0) - FLAT, out=part)
+        return found
 
     def random_starts(self, count: int, seed: int) -> np.ndarray:
         """(start, entry) unbounded: the given start, then random ones, uniform between bounds where there are two."""

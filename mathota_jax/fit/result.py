@@ -30,11 +30,12 @@ class FitResult:
         units: of the values.
         values: (entry,) estimates.
         lower, upper: (entry,) ends of the confidence intervals; those of a value that the data do not determine reach to
-            its bounds or to infinity.
+            its bounds or to infinity, and those of one at a bound end there.
         confidence: of the intervals.
         correlation: (entry, entry) of the estimates.
-        covariance: (entry, entry) of the unbounded numbers that the optimiser moves.
-        noise_factor: root mean square of the residuals in units of the noise given.
+        covariance: (entry, entry) of the estimates; infinite where they are not determined.
+        noise_factor: root mean square of the residuals in units of the noise given; with `huber` an estimate of the same
+            that far residuals hardly move.
         warnings: what the user should know before believing the values.
         cost: half the sum of squared residuals, or of Huber's function of them.
         steps: of the optimiser.

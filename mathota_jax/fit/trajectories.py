@@ -50,7 +50,7 @@ class Trajectories:
         set_field("bodies", (self.bodies,) if isinstance(self.bodies, str) else tuple(self.bodies))
         if len(set(self.bodies)) != len(self.bodies) or not self.bodies:
             raise ValueError(f"trajectories: bodies must be different names, at least one, got {self.bodies}")
-        if not (isinstance(self.dt, int | float | np.number | np.ndarray) and np.ndim(self.dt) == 0):
+        if np.ndim(self.dt) != 0 or np.asarray(self.dt).dtype.kind not in "iuf":
             raise ValueError(f"trajectories: dt must be one number of seconds, got {self.dt!r}")
         set_field("dt", float(self.dt))
         if not (self.dt > 0 and math.isfinite(self.dt)):
@@ -165,6 +165,8 @@ class Trajectories:
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:
+    if np.iscomplexobj(value):
+        raise ValueError(f"trajectories: {name} must be an array of real numbers, got complex ones")
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:

@@ -17,11 +17,13 @@ class Transform(NamedTuple):
         name: for messages and reports.
         to_value: unbounded array -> parameter of the same shape, JAX.
         to_unbounded: its inverse, NumPy float64.
+        elementwise: whether each number is mapped alone.
     """
 
     name: str
     to_value: Callable[[Any], Any]
     to_unbounded: Callable[[Any], np.ndarray]
+    elementwise: bool = True
 
 
 def identity() -> Transform:
@@ -51,7 +53,12 @@ def logit(lower: float, upper: float) -> Transform:
         share = (np.asarray(value, float) - lower) / (upper - lower)
         return np.log(share) - np.log1p(-share)
 
-    return Transform("logit", lambda u: lower + (upper - lower) * jax.nn.sigmoid(u), inverse)
+    def to_value(u: Any) -> Any:
+        # From the nearer bound: 1 less a sigmoid near 1 loses its slope in float32.
+        width = upper - lower
+        return jnp.where(u < 0, lower + width * jax.nn.sigmoid(u), upper - width * jax.nn.sigmoid(-u))
+
+    return Transform("logit", to_value, inverse)
 
 
 def moments() -> Transform:
@@ -71,7 +78,7 @@ def moments() -> Transform:
         value = np.asarray(value, float)
         return np.log(value.sum() / 2 - value)
 
-    return Transform("consistent moments", to_value, inverse)
+    return Transform("consistent moments", to_value, inverse, elementwise=False)
 
 
 NAMES = ("identity", "log", "softplus", "logit")

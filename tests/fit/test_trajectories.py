@@ -60,6 +60,8 @@ def changed(name, where, value):
         ({"position": "motion"}, "position must be an array of numbers"),
         ({"dt": 0.0}, "dt must be a positive number"),
         ({"dt": [0.1, 0.2]}, "dt must be one number"),
+        ({"dt": True}, "dt must be one number of seconds, got True"),
+        ({"position": np.zeros((2, 3, 2, 3), complex)}, "position must be an array of real numbers"),
         ({"bodies": ("ball", "ball")}, "different names"),
         ({"action": np.zeros((2, 3, 1))}, r"action must have shape \(2, 2, motor\)"),
         ({"action": np.full((2, 2, 1), NAN)}, "action must not hold NaN"),
@@ -163,6 +165,29 @@ def test_csv(tmp_path):
     assert np.isnan(data.orientation[0, 1]).all() and data.orientation[0, 3, 0, 1] == 1
 
 
+@pytest.mark.parametrize(("rate", "decimals"), [(24, 3), (30, 3), (60, 3), (120, 3), (240, 3), (59.94, 3), (240, 4)])
+@pytest.mark.parametrize("lost", [slice(0), slice(20, 140)], ids=["complete", "gap"])
+def test_rounded_times(tmp_path, rate, decimals, lost):
+    """Frames are counted as they were recorded, two seconds of lost ones too, and their rate is right to rounding."""
+    frames = np.delete(np.arange(200), lost)
+    lines = [f"{k / rate + 5.0003:.{decimals}f},ball,{k},0,0" for k in frames]
+    path = tmp_path / "motion.csv"
+    path.write_text("\n".join(["time,body,x,y,z", *lines]))
+    data = load(path)
+    expected = np.full(200, NAN)
+    expected[frames] = frames
+    np.testing.assert_array_equal(data.position[0, :, 0, 0], expected)
+    assert abs(data.dt * 199 - 199 / rate) < 10.0**-decimals
+
+
+def test_times_rounded_too_coarsely(tmp_path):
+    """Milliseconds at 400 frames a second differ by 2 or 3: whether these are 1 and 1 frames or 2 and 3 is not guessed."""
+    path = tmp_path / "motion.csv"
+    path.write_text("\n".join(["time,body,x,y,z", *(f"{k / 400:.3f},ball,0,0,0" for k in range(60))]))
+    with pytest.raises(ValueError, match="off the grid of frames"):
+        load(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -202,6 +227,15 @@ def test_bad_files(tmp_path):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"motion\.npz: not an NPZ file"):
             load(path)
+    with open(path, "wb") as file:
+        np.save(file, np.zeros((4, 1, 3)))
+    with pytest.raises(ValueError, match=r"motion\.npz: not an NPZ file .*numpy\.save"):
+        load(path)
+    np.savez(path, dt=0.1, bodies=[3], position=np.zeros((4, 1, 3)))
+    with pytest.raises(ValueError, match=r"bodies must be names, got \[3\]"):
+        load(path)
+    np.savez(path, dt=0.1, bodies=[b"ball"], position=np.zeros((4, 1, 3)))
+    assert load(path).bodies == ("ball",)
     np.savez(path, dt=0.1, position=np.zeros((4, 1, 3)))
     with pytest.raises(ValueError, match="the key 'bodies' is missing"):
         load(path)

@@ -20,6 +20,12 @@ def build_scene():
 
 def nothing():
     return None
+
+def broken():
+    return build_scene().add_body(None)
+
+def demanding(size):
+    return build_scene()
 """
 
 
@@ -69,11 +75,28 @@ def test_adam(files):
         ({"scene": "lost.py"}, "no file"),
         ({"scene": "scene.py:nothing"}, "must return a SceneBuilder, got NoneType"),
         ({"scene": "scene.py:other"}, "has no function other()"),
+        ({"scene": "scene.py:broken"}, "scene.py:broken: broken() failed in line 14 of"),
+        ({"scene": "scene.py:demanding"}, "demanding() failed: TypeError: demanding() missing 1 required positional"),
+        ({"scene": "motion.py"}, "motion.py can not be loaded in line 2 of"),
     ],
 )
 def test_errors(files, capsys, changes, message):
+    (files / "motion.py").write_text("import numpy\nnumpy.nothing\n")
     assert run(files, **changes) == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("output", ["scene.py", "scene.py/deeper"])
+def test_the_output_is_tried_before_the_fit(files, capsys, monkeypatch, output):
+    monkeypatch.setattr(command, "fit", lambda *given, **settings: pytest.fail("fitted first"))
+    assert run(files, "--output", str(files / output)) == 2
+    assert f"--output {files / output}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "nan", "inf"])
+def test_the_learning_rate_is_positive(files, capsys, rate):
+    assert run(files, "--method", "adam", f"--learning-rate={rate}") == 2
+    assert f"--learning-rate must be a positive number, got {float(rate)}" in capsys.readouterr().err
 
 
 def test_parameters_of_the_command_line():

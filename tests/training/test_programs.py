@@ -49,6 +49,18 @@ def test_earlier_runs_are_not_overwritten(tmp_path, capsys):
     assert (tmp_path / "metrics.json").read_text() == "{}"
 
 
+@pytest.mark.parametrize("arguments", [["--output", "file/run"], ["--output", "file"], ["--output", "/proc"], []])
+def test_folders_that_can_not_be_used(arguments, tmp_path, monkeypatch, capsys):
+    """A file stands in their way, also in that of the folder that is made where none is named; or they take no files."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("file", "runs"):
+        (tmp_path / name).write_text("")
+    assert train.main(["--env", ENVIRONMENT_ID, *arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert (arguments[-1] if arguments else "runs/InvertedPendulum-v0") in error and "give another" in error
+
+
 @pytest.mark.parametrize(
     "backend",
     ["sb3", "jax", pytest.param("gradient", marks=pytest.mark.slow)],  # reverse mode compiles for two minutes

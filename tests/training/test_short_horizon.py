@@ -41,10 +41,20 @@ class Push(Environment):
         return env_state, state, -(state[0] ** 2), jnp.array(False), self.is_truncated(env_state.step_count), {}
 
 
-def test_actor_gradient_in_closed_form():
-    """Policy a = b, constant and without noise: x_k = 1 + k b, and the value of x_4 is that of the critic."""
+@pytest.mark.parametrize(("bound", "worlds"), [(1e4, 4), (0.2, 4), (0.2, 8)])
+def test_actor_gradient_in_closed_form(bound, worlds):
+    """Policy a = b, constant and without noise: x_k = 1 + k b, and the value of x_4 is that of the critic.
+
+    What the return of one world passes back to the state before each step is bounded, however many worlds there are.
+    """
     settings = replace(
-        SMALL, worlds=4, horizon=4, minibatch_count=4, discount=0.9, initial_log_standard_deviation=-20.0
+        SMALL,
+        worlds=worlds,
+        horizon=4,
+        minibatch_count=4,
+        discount=0.9,
+        initial_log_standard_deviation=-20.0,
+        maximum_state_norm=bound,
     )
     learner = ShortHorizonActorCritic(Push(), settings)
     state = learner.initial_state(0)
@@ -53,13 +63,19 @@ def test_actor_gradient_in_closed_form():
     actor = {**state.actor, "actor": layers}
     gradient, _ = jax.grad(learner.actor_loss, has_aux=True)(actor, state, jax.random.key(1))
 
-    def loss(bias):
-        places = 1.0 + jnp.arange(1, 5) * bias
-        value = state_value(state.target_critic, normalize(state.moments, places[-1:]))
-        discounts = 0.9 ** jnp.arange(4)
-        return -((1 - 0.9) * jnp.sum(discounts * -(places**2)) + 0.9**4 * value) / 4
+    def value(place):
+        return state_value(state.target_critic, normalize(state.moments, place[None, None]))[0]
 
-    assert gradient["actor"][-1]["bias"][0] == pytest.approx(float(jax.grad(loss)(-0.1)), rel=1e-4)
+    places = 1.0 - 0.1 * np.arange(1, 5)
+    passed = 0.9**4 * float(jax.grad(value)(jnp.asarray(places[-1])))
+    total, unbounded = 0.0, []
+    for k in reversed(range(4)):
+        by_place = (1 - 0.9) * 0.9**k * -2 * places[k] + passed
+        total += by_place  # the action moves the place as it is
+        unbounded.append(abs(by_place))
+        passed = np.clip(by_place, -bound, bound)
+    assert (max(unbounded[:-1]) > bound) == (bound < 1), "the bound must matter in this test, or not at all"
+    assert gradient["actor"][-1]["bias"][0] == pytest.approx(-total / 4, rel=1e-4)
 
 
 def test_pieces_of_episodes():

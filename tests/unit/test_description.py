@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from mathota_jax import Box, Hinge, Options, Plane, SceneBuilder, Sphere, describe
+from mathota_jax import Box, Cylinder, Hinge, Options, Plane, SceneBuilder, Sphere, describe
 from tests.scenes import quadruped, sphere_on_plane, undamped, with_dt
 
 
@@ -94,9 +94,30 @@ def test_pairs_that_touch_with_the_joints_held():
     assert lines(model)["rows"] == f"276 of contacts ({places}), 48 of joints"
 
 
-@pytest.mark.parametrize("options", [None, Options(sleep=True), Options(broadphase="all_pairs", sleep=True)])
-def test_memory_is_that_of_the_state(precision, options):
-    model, state = workshop(options)
+def tins(options):
+    """Cylinders on the plane: their contacts are matched by distance from step to step, unless that is switched off."""
+    builder = SceneBuilder()
+    builder.add_body(Plane(normal=(0, 1, 0), offset=0.0), static=True)
+    for k in range(3):
+        builder.add_body(Cylinder(0.1, 0.1), mass=1.0, position=(k, 0.1, 0.0))
+    return builder.build(options)
+
+
+@pytest.mark.parametrize(
+    ("scene", "options"),
+    [
+        (workshop, Options()),
+        (workshop, Options(sleep=True)),
+        (workshop, Options(broadphase="all_pairs", sleep=True)),
+        (workshop, Options(solver="soft_step")),
+        (tins, Options()),
+        (tins, Options(warm_start_match=0.0)),
+        (tins, Options(broadphase="all_pairs")),
+        (tins, Options(solver="soft_step", sleep=True)),
+    ],
+)
+def test_memory_is_that_of_the_state(precision, scene, options):
+    model, state = scene(options)
     size = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
     assert lines(model)["memory of a state"] == f"{size} bytes a world"
 
