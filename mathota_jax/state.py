@@ -88,7 +88,8 @@ class State:
     """State of one world (or of many, with leading axes, under `jax.vmap`).
 
     Attributes:
-      position: (body, 3) centres of mass [m], world frame.
+      position: (body, 3) centres of mass [m], world frame. A static body may be put elsewhere between steps, but for planes,
+        whose place is in the model (`shapes["plane"]`); its velocity, if given, moves and drags nothing.
       orientation: (body, 4) unit quaternions (w, x, y, z), world from body frame (as given to the builder, whatever the
         principal axes).
       velocity: (body, 3) of the centres of mass [m/s], world frame.
