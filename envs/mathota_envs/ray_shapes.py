@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mathota_jax.collision.ray_frame import RayHit
+from mathota_jax.collision.ray_heightfield import ray_surface
 from mathota_jax.collision.rays import RAYS
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot
@@ -54,7 +56,7 @@ def _closed_form(
     return RayShape(meet, patterned)
 
 
-def _of_the_engine(kind: str, patterned: bool) -> RayShape:
+def _of_the_engine(rays: Callable[..., RayHit], patterned: bool) -> RayShape:
     """A shape by the engine's own rays, to which shapes and worlds are the last two axes: here one shape, and the rays."""
 
     def meet(origin: Vec3, direction: Vec3, placed: Placed) -> tuple[Array, Vec3]:
@@ -64,7 +66,7 @@ def _of_the_engine(kind: str, patterned: bool) -> RayShape:
         }
         pose = jax.tree.map(lambda leaf: leaf[..., None, None], Pose(placed.position, placed.rotation))
         start, heading = (vector.map(lambda c: c[None]) for vector in (origin, direction))
-        found = RAYS[kind](size, pose, start, heading)
+        found = rays(size, pose, start, heading)
         return _entry(found.hit, found.distance)[0], found.normal.map(lambda c: c[0])
 
     return RayShape(meet, patterned)
@@ -164,9 +166,10 @@ RAY_SHAPES = {
     "sphere": _closed_form(sphere_distance, sphere_normal, patterned=True),
     "box": _closed_form(box_distance, box_normal, patterned=False),
     "capsule": _closed_form(capsule_distance, capsule_normal, patterned=True),
-    "cylinder": _of_the_engine("cylinder", patterned=True),
-    "cone": _of_the_engine("cone", patterned=True),
-    "polyhedron": _of_the_engine("polyhedron", patterned=False),
-    "heightfield": _of_the_engine("heightfield", patterned=False),
+    "cylinder": _of_the_engine(RAYS["cylinder"], patterned=True),
+    "cone": _of_the_engine(RAYS["cone"], patterned=True),
+    "polyhedron": _of_the_engine(RAYS["polyhedron"], patterned=False),
+    # Of the surface alone: walls without an end would stand in every picture from the side.
+    "heightfield": _of_the_engine(ray_surface, patterned=False),
     "plane": _closed_form(plane_distance, plane_normal, patterned=False),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
@@ -11,7 +12,7 @@ from mathota_jax.collision.height_grid import gather_heights
 from mathota_jax.collision.ray_frame import PARALLEL, LocalRay, RayHit, far, hit_at, local_ray, slab
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import settle, settle_code
-from mathota_jax.spatial.vector import Vec3, norm, where
+from mathota_jax.spatial.vector import Vec3, norm
 
 
 class _GridRay(NamedTuple):
@@ -36,7 +37,37 @@ class _Walk(NamedTuple):
 
 
 def ray_heightfield(field: dict[str, Any], pose: Pose, origin: Vec3, direction: Vec3) -> RayHit:
-    """First place where a ray comes from above the surface to below it, or through a wall under the border.
+    """First place where a ray enters the ground: from above, or through a wall under the border."""
+    surface = ray_surface(field, pose, origin, direction)
+    ray = local_ray(pose, origin, direction)
+    grid = _in_cells(field, ray)
+    rows, columns = field["heights"].shape[:2]
+    axis = _wall(*lax.stop_gradient((grid, ray, field["heights"])))
+    along_u, along_v = (
+        -(p - 0.5 * (count - 1) + jnp.sign(rate) * 0.5 * (count - 1)) / jnp.where(jnp.abs(rate) > PARALLEL, rate, 1.0)
+        for p, rate, count in ((grid.u, grid.du, rows), (grid.v, grid.dv, columns))
+    )
+    zero = jnp.zeros_like(grid.y)
+    outward = Vec3(jnp.where(axis == 1, -jnp.sign(grid.du), zero), zero, jnp.where(axis == 2, -jnp.sign(grid.dv), zero))
+    code = jnp.where(axis > 0, 0, -1)
+    wall = hit_at(pose, ray, code, jnp.where(axis == 1, along_u, along_v), outward)
+    return jax.tree.map(lambda of_wall, of_surface: jnp.where(wall.hit, of_wall, of_surface), wall, surface)
+
+
+def _in_cells(field: dict[str, Any], ray: LocalRay) -> _GridRay:
+    cell, (rows, columns) = field["cell_size"], field["heights"].shape[:2]
+    return _GridRay(
+        ray.origin.x / cell + 0.5 * (rows - 1),
+        ray.origin.z / cell + 0.5 * (columns - 1),
+        ray.origin.y,
+        ray.direction.x / cell,
+        ray.direction.z / cell,
+        ray.direction.y,
+    )
+
+
+def ray_surface(field: dict[str, Any], pose: Pose, origin: Vec3, direction: Vec3) -> RayHit:
+    """First place where a ray comes from above the surface to below it.
 
     Along the ray the surface is straight between the places where the ray passes a grid line or a diagonal (J. Amanatides
     and A. Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987). The height over the surface is carried from one
@@ -45,15 +76,7 @@ def ray_heightfield(field: dict[str, Any], pose: Pose, origin: Vec3, direction: 
     """
     ray = local_ray(pose, origin, direction)
     heights, cell = field["heights"], field["cell_size"]
-    rows, columns = heights.shape[:2]
-    grid = _GridRay(
-        ray.origin.x / cell + 0.5 * (rows - 1),
-        ray.origin.z / cell + 0.5 * (columns - 1),
-        ray.origin.y,
-        ray.direction.x / cell,
-        ray.direction.z / cell,
-        ray.direction.y,
-    )
+    grid = _in_cells(field, ray)
     walk = _search(*lax.stop_gradient((grid, ray, heights, cell)))
     height, slope_u, slope_v = _plane(heights, walk.row, walk.column, walk.upper)
     gap = grid.y - (height + slope_u * (grid.u - walk.row) + slope_v * (grid.v - walk.column))
@@ -64,19 +87,6 @@ def ray_heightfield(field: dict[str, Any], pose: Pose, origin: Vec3, direction: 
     parameter = jnp.where(usable, -gap / jnp.where(usable, rate, -1.0), lax.stop_gradient(walk.parameter))
     normal = Vec3(-slope_u / cell, jnp.ones_like(slope_u), -slope_v / cell)
     normal = normal / norm(normal)
-    axis = _wall(*lax.stop_gradient((grid, ray, heights)))
-    through = [
-        -(p + jnp.sign(rate) * 0.5 * (count - 1)) / jnp.where(jnp.abs(rate) > PARALLEL, rate, 1.0)
-        for p, rate, count in (
-            (grid.u - 0.5 * (rows - 1), grid.du, rows),
-            (grid.v - 0.5 * (columns - 1), grid.dv, columns),
-        )
-    ]
-    parameter = jnp.where(axis == 1, through[0], jnp.where(axis == 2, through[1], parameter))
-    zero = jnp.zeros_like(parameter)
-    normal = where(axis == 1, Vec3(-jnp.sign(grid.du), zero, zero), normal)
-    normal = where(axis == 2, Vec3(zero, zero, -jnp.sign(grid.dv)), normal)
-    code = jnp.where(axis > 0, 0, code)
     return hit_at(pose, ray, code, parameter, normal.map(lambda c: jnp.where(code >= 0, c, 0.0)))
 
 
