@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mathota_jax import Box, Flag, Heightfield, Plane, SceneBuilder, Sphere, rollout
+from mathota_jax import Box, Flag, Heightfield, Plane, SceneBuilder, Sphere, rollout, time_of_impact
 from mathota_jax.collision.pairs import PAIRS
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.vector import Vec3
@@ -181,3 +181,14 @@ def test_the_inside_of_a_bowl_has_no_walls(float64):
     found = run("sphere", heights, position, np.tile(UPRIGHT, (3, 1)))
     assert (np.abs(found["normal"][..., 1][found["active"]]) > 0.01).all()
     assert found["active"][0].all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", [Sphere(0.3), Box((0.3, 0.15, 0.25))], ids=["sphere", "box"])
+def test_flight_into_a_wall(shape, float64, gate):
+    """From beside, 2 m away, at 4 m/s, well under the border."""
+    still, flying = (np.zeros(3), np.zeros(3)), (np.array([-4.0, 0.0, 0.0]), np.zeros(3))
+    start = (np.array([HALF + 2.0 + 0.3, -1.0, 0.1]), UPRIGHT)
+    hit = time_of_impact(Heightfield(LEVEL, CELL), (np.zeros(3), UPRIGHT), still, shape, start, flying, 1.0)
+    assert bool(hit.hit)
+    gate("time [s]", hit.time - 0.5, 1e-6)
