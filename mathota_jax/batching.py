@@ -32,6 +32,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
+from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.real_results import is_real, restricted
 from mathota_jax.spatial.varying import as_varying, result_types
 from mathota_jax.spatial.world_parts import FEWEST, by_parts, part_size, part_size_of_derivative, parts_pay
@@ -97,12 +98,8 @@ class TreeFunction:
     def _arguments(self, leaves: Sequence[Array]) -> list[Any]:
         """What belongs to each world is given in each, though what is mapped may be something else."""
         worlds = max((leaf.shape[-1] for leaf in leaves), default=1)
-
-        def in_each(leaf: Array) -> Array:
-            return jnp.broadcast_to(leaf, (*leaf.shape[:-1], worlds))
-
         arguments = jax.tree.unflatten(self.in_tree, leaves)
-        return [jax.tree.map(in_each, a) if getattr(a, "in_each_world", False) else a for a in arguments]
+        return [in_every_world(a, worlds) if getattr(a, "in_each_world", False) else a for a in arguments]
 
     def again(self, shortcut: Shortcut, result: Any, leaves: Sequence[Array]) -> tuple[TreeFunction, list[Array]]:
         """The function by its shortcut, and the arrays that it needs before the arguments."""

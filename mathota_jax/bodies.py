@@ -177,7 +177,7 @@ def moving_inertia(scene: Scene, model: Model, orientation: Quaternion) -> Inert
     """
     given = take((model.mass, vector(model.inertia)), scene.dynamic_bodies)
     mass, moments = jax.tree.map(lambda value: jnp.where(value > 0, value, jnp.nan), given)
-    if all(scene.spherical[body] for body in scene.dynamic_bodies):
+    if scene.all_spherical:
         return Inertia(1.0 / mass, moments, None)
     frame = None if model.inertia_frame is None else take(quaternion(model.inertia_frame), scene.dynamic_bodies)
     return Inertia(1.0 / mass, moments, to_matrix(_principal(orientation, frame)), frame)

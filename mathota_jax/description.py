@@ -115,7 +115,7 @@ def _features(scene: Scene) -> list[str]:
         "joints": bool(scene.joints),
         "exact joints": layout(scene) is not None,
         "contacts with the joints held": takes_contacts(scene),
-        "gyroscopic torque": not all(scene.spherical[body] for body in scene.dynamic_bodies),
+        "gyroscopic torque": not scene.all_spherical,
         "linear damping": options.linear_damping > 0,
         "angular damping": options.angular_damping > 0,
         "warm start": options.warm_start,

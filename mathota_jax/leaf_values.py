@@ -49,9 +49,8 @@ def values_in_range(model: Model) -> Array:
 def _fits_the_program(model: Model) -> list[Array]:
     """Values that a scene was built without, and which its program does not know."""
     scene, fine = model.scene, []
-    moving = scene.dynamic_bodies
-    if moving and all(scene.spherical[body] for body in moving):
-        moments = take(model.inertia, moving)
+    if scene.dynamic_bodies and scene.all_spherical:
+        moments = take(model.inertia, scene.dynamic_bodies)
         fine.append(~(moments.max(1) - moments.min(1) > UNEQUAL * moments.max(1)))
     for group in scene.pair_groups:
         if group.window is not None:

@@ -192,6 +192,11 @@ class Scene:
         return frozenset(body for joint in self.joints for body in (joint.parent, joint.child))
 
     @functools.cached_property
+    def all_spherical(self) -> bool:
+        """Whether the inertia of every moving body is the same about every axis: then nothing asks for principal axes."""
+        return all(self.spherical[body] for body in self.dynamic_bodies)
+
+    @functools.cached_property
     def rebounds_may_gain(self) -> bool:
         """Whether anything bounces whose rebound may take more energy than the impact had.
 

@@ -20,8 +20,8 @@ from mathota_jax.spatial.vector import Vec3, dot, normalize
 
 NEIGHBOURS = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))
 """Grid points that share an edge with a grid point, as offsets (row, column); the last three opposite to the first."""
-
-
+SEAM = 1e-5
+"""Triangles, and walls, overlap by this share of a cell, so that no point falls between them."""
 DOWN = 4.0
 """By how many sizes of the body upright edges end below its centre."""
 
@@ -139,10 +139,8 @@ def triangles(window: Window) -> Triangles:
 def edges(window: Window, size: Array) -> Edges:
     """All edges of a window: along rows, along columns, diagonal, upright, for bodies of that size [m]."""
     p, lower, upper = window.points, window.lower, window.upper
-    rows, columns = window.field["heights"].shape[:2]
     down, right = lower.x.shape[:2]
-    first_row, last_row = window.row == 0, window.row == rows - 1 - down
-    first_column, last_column = window.column == 0, window.column == columns - 1 - right
+    (first_row, last_row), (first_column, last_column) = _borders(window)
 
     def walled(normals: Vec3, axis: int, sign: float, front: bool) -> Vec3:
         """Normals with those of the wall at one border attached."""
@@ -185,9 +183,8 @@ def edges(window: Window, size: Array) -> Edges:
             jnp.ones((1, 1, 1, 1), bool),
             _point_numbers(window, -1, -1),
         ),
+        _upright_edges(window, size, (first_row, last_row), (first_column, last_column)),
     ]
-
-    groups.append(_upright_edges(window, size, (first_row, last_row), (first_column, last_column)))
 
     def joined(values: list[Any]) -> Vec3:
         return Vec3(*(jnp.concatenate([listed(v) for v in components]) for components in zip(*values, strict=True)))
@@ -227,7 +224,6 @@ def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Ar
         For each of `NEIGHBOURS` the way there (point, pair, world) and whether it is in the window (point, 1, 1);
         whether the point is known with all its neighbours; whether it is at the border of the grid; its number.
     """
-    rows, columns = window.field["heights"].shape[:2]
     count_down, count_right = window.points.x.shape[:2]
     ways = []
     down = np.arange(count_down).reshape(-1, 1)
@@ -237,15 +233,22 @@ def peak_cones(window: Window) -> tuple[list[tuple[Vec3, np.ndarray]], Array, Ar
         present = (down + i >= 0) & (down + i < count_down) & (right + j >= 0) & (right + j < count_right)
         ways.append((way, present.reshape(-1, 1, 1)))
     d, r = down[..., None, None], right[..., None, None]
+    (first_row, last_row), (first_column, last_column) = _borders(window)
     ends = (
-        (d == 0, window.row == 0),
-        (d == count_down - 1, window.row == rows - count_down),
-        (r == 0, window.column == 0),
-        (r == count_right - 1, window.column == columns - count_right),
+        (d == 0, first_row),
+        (d == count_down - 1, last_row),
+        (r == 0, first_column),
+        (r == count_right - 1, last_column),
     )
     known = functools.reduce(operator.and_, (~last | border for last, border in ends))
     at_border = functools.reduce(operator.or_, (last & border for last, border in ends))
     return ways, listed(known), listed(at_border), _point_numbers(window, None, None)
+
+
+def _borders(window: Window) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Whether the first and the last points of a window, along rows and along columns, are those of the grid."""
+    (rows, columns), (down, right) = window.field["heights"].shape[:2], window.points.x.shape[:2]
+    return (window.row == 0, window.row == rows - down), (window.column == 0, window.column == columns - right)
 
 
 def _point_numbers(window: Window, stop_down: int | None, stop_right: int | None) -> Array:

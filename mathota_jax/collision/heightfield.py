@@ -29,6 +29,7 @@ from jax import Array, lax
 from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_tolerance, pick
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import (
+    SEAM,
     Window,
     grid_window,
     ground_at,
@@ -47,8 +48,6 @@ from mathota_jax.spatial.settle import compute_once, settle
 from mathota_jax.spatial.spread import least
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm, where
 
-SEAM = 1e-5
-"""Triangles overlap by this share of a cell, so that no point falls between them."""
 FLAT = 1e-5
 """A grid point must stand out of its neighbours' plane by this share of a cell to be a peak."""
 LEANING = 0.02

@@ -10,7 +10,7 @@ from jax import Array, lax
 
 from mathota_jax.collision.candidates import best_candidate, pick
 from mathota_jax.collision.convex.support import SUPPORT
-from mathota_jax.collision.height_grid import Window, ground_at, height_over
+from mathota_jax.collision.height_grid import SEAM, Window, ground_at, height_over
 from mathota_jax.spatial.settle import settle
 from mathota_jax.spatial.vector import Mat3, Vec3, dot
 
@@ -83,7 +83,7 @@ def depth_under(window: Window, point: Vec3) -> Array:
 
 def along_wall(window: Window, point: Vec3) -> Array:
     """Whether points on a wall (..., pair, world) are between its two ends."""
-    slack = 1e-5 * window.field["cell_size"]
+    slack = SEAM * window.field["cell_size"]
     half_x, half_z = _halves(window)
     inside = jnp.abs(point.x + window.center.x) <= half_x + slack
     return inside & (jnp.abs(point.z + window.center.z) <= half_z + slack)

@@ -38,9 +38,9 @@ class _Walk(NamedTuple):
 
 def ray_heightfield(field: dict[str, Any], pose: Pose, origin: Vec3, direction: Vec3) -> RayHit:
     """First place where a ray enters the ground: from above, or through a wall under the border."""
-    surface = ray_surface(field, pose, origin, direction)
     ray = local_ray(pose, origin, direction)
     grid = _in_cells(field, ray)
+    surface = _on_surface(field, pose, ray, grid)
     rows, columns = field["heights"].shape[:2]
     axis = _wall(*lax.stop_gradient((grid, ray, field["heights"])))
     along_u, along_v = (
@@ -67,16 +67,20 @@ def _in_cells(field: dict[str, Any], ray: LocalRay) -> _GridRay:
 
 
 def ray_surface(field: dict[str, Any], pose: Pose, origin: Vec3, direction: Vec3) -> RayHit:
-    """First place where a ray comes from above the surface to below it.
+    """First place where a ray comes from above the surface to below it; it passes through the walls."""
+    ray = local_ray(pose, origin, direction)
+    return _on_surface(field, pose, ray, _in_cells(field, ray))
+
+
+def _on_surface(field: dict[str, Any], pose: Pose, ray: LocalRay, grid: _GridRay) -> RayHit:
+    """Where a ray comes from above the surface to below it.
 
     Along the ray the surface is straight between the places where the ray passes a grid line or a diagonal (J. Amanatides
     and A. Woo, "A Fast Voxel Traversal Algorithm for Ray Tracing", 1987). The height over the surface is carried from one
     such place to the next, so that no ray slips between two triangles. The walk is a search; the hit is then computed,
     differentiably, from the triangle found. Heights have shape (row, column, shape, world).
     """
-    ray = local_ray(pose, origin, direction)
     heights, cell = field["heights"], field["cell_size"]
-    grid = _in_cells(field, ray)
     walk = _search(*lax.stop_gradient((grid, ray, heights, cell)))
     height, slope_u, slope_v = _plane(heights, walk.row, walk.column, walk.upper)
     gap = grid.y - (height + slope_u * (grid.u - walk.row) + slope_v * (grid.v - walk.column))

@@ -10,8 +10,21 @@ TOUCHING = 1e-3
 """Gap at which bodies touch that do not move relative to each other, as a share of the inner radius of the smaller one;
 and height, as the same share, that a rebound must reach to be one."""
 
+MEETS = 4.0
+"""Gap, in tolerances of the search for a touch, up to which bodies meet at the time of an impact."""
+
 ROUND_OFF = 64
 """Multiples of the machine epsilon, of the velocities at play, within which an approach is round-off."""
+
+
+def tolerance(dtype: jnp.dtype) -> float:
+    """Gap at which the search for a touch ends, as a share of the inner radius; a Newton step takes it to round-off."""
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def meet(gap: Array, size: Array) -> Array:
+    """Whether bodies with that inner radius of the smaller one, and that gap, meet at the time of an impact."""
+    return gap <= MEETS * tolerance(gap.dtype) * size
 
 
 def rest_speed(gravity: Array, dt: Array, size: Array, scale: Array) -> Array:

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from mathota_jax.constraints.contact import ContactRows, Load, normal_mass
+from mathota_jax.solver.row_matrix import sum_over_points
 from mathota_jax.solver.rows import Rows, with_first_bias
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle
-from mathota_jax.spatial.spread import add_slices
 
 
 def resting(contacts: Sequence[ContactRows], last: Sequence[Array], fall: Array, dt: Array) -> list[ContactRows]:
@@ -47,6 +47,4 @@ def resting(contacts: Sequence[ContactRows], last: Sequence[Array], fall: Array,
 def _of_pair(rows: Rows, impulse: Array) -> Array:
     """(turn, 1, column, world) sum of the normal impulses of all points of the pair of each column."""
     points = rows.table.together
-    normal = impulse[:, 0].reshape(len(impulse), -1, points, impulse.shape[-1])
-    total = jnp.broadcast_to(add_slices(normal, 2)[:, :, None], normal.shape)
-    return total.reshape(len(impulse), 1, -1, impulse.shape[-1])
+    return jnp.repeat(sum_over_points(impulse[:, 0], points), points, axis=1)[:, None]

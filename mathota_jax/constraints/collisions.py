@@ -18,7 +18,7 @@ from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, Inertia, moving_inertia, smaller_moving, unpack_blocks
 from mathota_jax.collision.narrowphase import SPECULATIVE, ContactSet, find_contacts
-from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
+from mathota_jax.collision.rest import TOUCHING, meet, next_touch, rest_speed
 from mathota_jax.constraints import contact, joint
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.contact import ContactRows
@@ -329,8 +329,7 @@ def _touch(model: Model, bodies: Bodies, contacts: ContactSet, pull: Array) -> A
     size = smaller_moving(model, *sides)
     rests = speed <= rest_speed(pull, model.dt, size, scale)
     gap = contacts.separation
-    meets = gap <= 4.0 * float(jnp.finfo(gap.dtype).eps) ** 0.5 * size
-    return settle(jnp.where(meets | (rests & (gap <= TOUCHING * size)), 1.0, 0.0)) > 0.5
+    return settle(jnp.where(meet(gap, size) | (rests & (gap <= TOUCHING * size)), 1.0, 0.0)) > 0.5
 
 
 def _held(model: Model, joints: JointRows, inertia: Inertia, velocity: Array) -> tuple[Rows, ...]:

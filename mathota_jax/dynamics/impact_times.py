@@ -19,7 +19,7 @@ from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, smaller_moving
 from mathota_jax.collision.narrowphase import find_contacts
-from mathota_jax.collision.rest import TOUCHING, next_touch, rest_speed
+from mathota_jax.collision.rest import TOUCHING, meet, next_touch, rest_speed, tolerance
 from mathota_jax.dynamics.flight import Flight
 from mathota_jax.dynamics.pair_motion import contacts_between, reaches, turning
 from mathota_jax.model import Model
@@ -66,11 +66,6 @@ class _Search(NamedTuple):
     count: Array
 
 
-def tolerance(dtype: jnp.dtype) -> float:
-    """Gap at which the search ends, as a share of the inner radius; one step of Newton's method takes it to round-off."""
-    return float(jnp.finfo(dtype).eps) ** 0.5
-
-
 def first_impact(
     model: Model, flight: Flight, separation: Array, gravity: Vec3, left: Array, wanted: Array
 ) -> FirstImpact:
@@ -101,7 +96,8 @@ def first_impact(
         best = jnp.minimum(best, jnp.where(touches, time, jnp.inf).min(0))
         happens = happens | touches.any(0)
         slots.append(jnp.repeat(jnp.where(touches, time, jnp.inf), group.point_count, axis=0))
-    time, delay = _with_derivative(model, flight, end, best, happens, jnp.concatenate(slots), jnp.concatenate(levels))
+    met, level = jnp.concatenate(slots), jnp.concatenate(levels)
+    time, delay = _with_derivative(model, flight, pull, end, best, happens, met, level)
     return FirstImpact(jnp.where(happens, time, left), happens, delay)
 
 
@@ -204,7 +200,14 @@ def _by_point(values: Array, count: int, shape: tuple[int, int]) -> list[Array]:
 
 
 def _with_derivative(
-    model: Model, flight: Flight, end: Array, time: Array, happens: Array, meets: Array, level: Array
+    model: Model,
+    flight: Flight,
+    pull: Array,
+    end: Array,
+    time: Array,
+    happens: Array,
+    meets: Array,
+    level: Array,
 ) -> tuple[Array, Array]:
     """The time where something happens, refined by one step of Newton's method, which carries the derivative.
 
@@ -226,7 +229,7 @@ def _with_derivative(
     step = _step_of_deepest(candidate, gap, rate)[0]
     least = jnp.finfo(time.dtype).eps * end
     refined = jnp.clip(time + lax.stop_gradient(step), least, end)
-    candidate = candidate | (active & happens & _meets_too(model, lax.stop_gradient((placed, gap, rate))))
+    candidate = candidate | (active & happens & _meets_too(model, lax.stop_gradient((placed, gap, rate)), pull))
     delay = jnp.where(happens, _delays(model.scene, candidate, gap, rate, step), 0.0)
     return jnp.where(happens, refined + step - lax.stop_gradient(step), end), delay
 
@@ -239,15 +242,15 @@ def _step_of_deepest(candidate: Array, gap: Array, rate: Array) -> tuple[Array, 
     return -safe_divide((chosen * gap).sum(0), (chosen * rate).sum(0)), chosen.sum(0) > 0.5
 
 
-def _meets_too(model: Model, found: tuple[Bodies, Array, Array]) -> Array:
+def _meets_too(model: Model, found: tuple[Bodies, Array, Array], pull: Array) -> Array:
     """(slot, world) which points take part in the collision, and do not rest: those of `collisions.collide`."""
     bodies, gap, rate = found
     sides = model.scene.slot_bodies
     size = smaller_moving(model, *sides)
     speed = norm(bodies.velocity)
     scale = take(speed, sides[0]) + take(speed, sides[1])
-    rests = -rate <= rest_speed(norm(Vec3(*(model.gravity[axis][None] for axis in range(3)))), model.dt, size, scale)
-    return (gap <= 4.0 * tolerance(gap.dtype) * size) & ~rests
+    rests = -rate <= rest_speed(pull, model.dt, size, scale)
+    return meet(gap, size) & ~rests
 
 
 def _delays(scene: Scene, candidate: Array, gap: Array, rate: Array, step: Array) -> Array:

@@ -264,7 +264,6 @@ class Objective:
     def pulled(self, charts: np.ndarray) -> dict[tuple[str, str], float]:
         """How far beginnings (n, s, chart) lie off the scene in what was not recorded: (body, what) -> largest [spread]."""
         shape = (len(charts), len(self.moving), len(Motion._fields), 3)
-        shape = (len(charts), len(self.moving), len(Motion._fields), 3)
         away = np.abs(self.segments.pull[:, 0] * charts[:, 0]).reshape(shape).max((0, 3))
         held = np.asarray((self.segments.pull[:, 0] > 0).reshape(shape).any(0)).tolist()
         found = {}

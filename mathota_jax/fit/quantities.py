@@ -84,13 +84,8 @@ def _write_mass(model: Model, state: State, index: int, value: Any) -> World:
 EQUAL = "all moving bodies were built with three equal moments of inertia, which the engine relies on"
 
 
-def _only_equal_moments(model: Model) -> bool:
-    scene = model.scene
-    return all(scene.spherical[body] for body in scene.dynamic_bodies)
-
-
 def _unequal_moments(model: Model, index: int) -> str | None:
-    if _only_equal_moments(model):
+    if model.scene.all_spherical:
         return f"{EQUAL}; fit inertia_scale instead"
     return _static(model, index)
 
@@ -133,7 +128,7 @@ def _dimension(name: str) -> Quantity:
         found = entry(model, index)
         if not found:
             return f"the body is not one shape with a {name}; fit size instead"
-        if found.kind != "sphere" and not model.scene.static[index] and _only_equal_moments(model):
+        if found.kind != "sphere" and not model.scene.static[index] and model.scene.all_spherical:
             return f"{EQUAL}; build this one with sides that differ a little, or fit size instead"
         return None
 
