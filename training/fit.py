@@ -3,7 +3,8 @@
 The scene is a Python file (or a module) with a function ``build_scene() -> SceneBuilder``; another name follows a colon:
 ``--scene scenes.py:cube``. A parameter is given as ``NAME``, ``NAME=START`` or ``NAME=START:LOWER:UPPER`` (an empty part
 keeps the default), and tied ones as ``friction[cube]+friction[ground]=0.2``. The data are trajectories in NPZ or CSV; see
-`mathota_jax.fit.load_npz` and `mathota_jax.fit.load_csv` for the layouts. Writes ``report.html`` and ``fit.json``.
+`mathota_jax.fit.load_npz` and `mathota_jax.fit.load_csv` for the layouts. Writes ``report.html`` and ``fit.json`` to a new
+folder under ``runs/``, or to ``--output``, which must not hold an earlier fit.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ import numpy as np
 from mathota_jax import Options, SceneBuilder
 from mathota_jax.fit import FitResult, Noise, Parameter, fit, load
 from training.requirements import require_packages
-from training.run_folder import make_folder
+from training.run_folder import create_run_folder
 
 DEFAULT_FUNCTION = "build_scene"
+REPORT_FILE = "report.html"
+RESULT_FILE = "fit.json"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,11 +37,12 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         require_packages(("matplotlib", "tqdm", "optax"), "the command line of the fit")
-        print(_run(options))
+        result, folder = _run(options)
     except (ValueError, ImportError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"report: {options.output / 'report.html'}")
+    print(result)
+    print(f"report: {folder / REPORT_FILE}")
     return 0
 
 
@@ -109,35 +113,42 @@ def _failure(error: Exception) -> str:
     return f"{place}: {type(error).__name__}: {error}"
 
 
-def _run(options: argparse.Namespace) -> FitResult:
+def _run(options: argparse.Namespace) -> tuple[FitResult, Path]:
+    """The result and the folder in which it is."""
     from training.fit_report import write_report  # needs matplotlib
 
     builder = load_scene(options.scene)
     data = load(options.data)
     optimiser = _optimiser(options)
-    make_folder(options.output)
+    parameters = [parse_parameter(text) for text in options.parameter]
     model, state = builder.build(Options(linear_damping=options.damping, angular_damping=options.damping))
-    with _progress(options.steps, options.quiet) as progress:
-        result = fit(
-            model,
-            state,
-            [parse_parameter(text) for text in options.parameter],
-            data,
-            start=options.start,
-            noise=Noise(options.position_noise, float(np.radians(options.orientation_noise))),
-            substeps=options.substeps,
-            segments=options.segments,
-            horizons=options.horizons,
-            huber=options.huber,
-            start_count=options.starts,
-            seed=options.seed,
-            optimiser=optimiser,
-            step_limit=options.steps,
-            progress=progress,
-        )
-    write_report(options.output / "report.html", result, f"Fit of {Path(options.data).name}")
-    (options.output / "fit.json").write_text(json.dumps(summary(result), indent=2) + "\n")
-    return result
+    folder = create_run_folder("fit", RESULT_FILE, options.output)
+    try:
+        with _progress(options.steps, options.quiet) as progress:
+            result = fit(
+                model,
+                state,
+                parameters,
+                data,
+                start=options.start,
+                noise=Noise(options.position_noise, float(np.radians(options.orientation_noise))),
+                substeps=options.substeps,
+                segments=options.segments,
+                horizons=options.horizons,
+                huber=options.huber,
+                start_count=options.starts,
+                seed=options.seed,
+                optimiser=optimiser,
+                step_limit=options.steps,
+                progress=progress,
+            )
+    except BaseException:
+        if not any(folder.iterdir()):
+            folder.rmdir()
+        raise
+    write_report(folder / REPORT_FILE, result, f"Fit of {Path(options.data).name}")
+    (folder / RESULT_FILE).write_text(json.dumps(summary(result), indent=2) + "\n")
+    return result, folder
 
 
 def summary(result: FitResult) -> dict[str, Any]:
@@ -209,7 +220,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--position-noise", type=float, default=1e-3, help="[m] (default 0.001)")
     parser.add_argument("--orientation-noise", type=float, default=1.0, help="[degree] (default 1)")
     parser.add_argument("--damping", type=float, default=0.0, help="of the motion of all bodies [1/s] (default 0)")
-    parser.add_argument("--output", type=Path, default=Path("runs/fit"), help="folder of the report")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="default: a new folder under runs/")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     return parser
 

@@ -1,4 +1,4 @@
-"""Where a training run writes its results."""
+"""Where training and fits write their results."""
 
 import tempfile
 import time
@@ -9,23 +9,23 @@ CURVE_FILE = "learning_curve.png"
 REPLAY_FILE = "replay.html"
 
 
-def create_run_folder(environment_id: str, backend: str, output: Path | None = None) -> Path:
-    """Create ``runs/<environment>-<backend>-<time>``, or the folder that was asked for.
+def create_run_folder(name: str, result_file: str, output: Path | None = None) -> Path:
+    """Create ``runs/<name>-<time>``, or the folder that was asked for.
 
     Args:
-        environment_id: Its part before the last slash is left out.
-        backend: Name of the backend.
+        name: What is run.
+        result_file: Name of the file by which an earlier run is known.
         output: The folder to use instead; it may exist but must not hold an earlier run.
 
     Raises:
         ValueError: If ``output`` holds a run already, or the folder cannot be made or written to.
     """
     if output is not None:
-        if (output / METRICS_FILE).exists():
+        if (output / result_file).exists():
             raise ValueError(f"--output {output} holds an earlier run; give another folder or remove that one")
         make_folder(output)
         return output
-    base = f"{environment_id.rpartition('/')[2]}-{backend}-{time.strftime('%Y%m%d-%H%M%S')}"
+    base = f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
     attempt = 1
     while True:
         folder = Path("runs") / (base if attempt == 1 else f"{base}-{attempt}")

@@ -119,7 +119,8 @@ def prepare(request: Request) -> Plan:
     """
     require_packages(REQUIRED_PACKAGES[request.backend], f"training with backend {request.backend!r}")
     environment = make(request.environment_id)
-    folder = create_run_folder(request.environment_id, request.backend, request.output)
+    name = f"{request.environment_id.rpartition('/')[2]}-{request.backend}"
+    folder = create_run_folder(name, METRICS_FILE, request.output)
     return Plan(request, environment, request.hyperparameters(), folder)
 
 

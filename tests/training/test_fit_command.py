@@ -56,6 +56,15 @@ def test_report(files, capsys):
     assert "restitution[ball]" in page and "Residuals" in page
     found = json.loads((files / "out" / "fit.json").read_text())["parameters"]["restitution[ball]"]
     assert found["lower"] < 0.7 < found["upper"] and abs(found["estimate"] - 0.7) < 0.01
+    assert run(files, "--starts", "2") == 2
+    assert "holds an earlier run" in capsys.readouterr().err
+
+
+def test_what_can_not_be_fitted_leaves_no_folder(files, monkeypatch):
+    monkeypatch.chdir(files)
+    words = ["--scene", "scene.py", "--data", "motion.npz", "--parameter", "bounce[ball]", "--quiet"]
+    assert command.main(words) == 2
+    assert not list((files / "runs").iterdir())
 
 
 def test_adam(files):
