@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -76,6 +76,11 @@ def batch_last(
     def natural(*args: Any) -> Any:
         leaves, in_tree = jax.tree.flatten(args)
         leaves = as_varying([leaf if isinstance(leaf, Array) else jnp.asarray(leaf) for leaf in leaves])
+        if _is_wide(leaf.dtype for leaf in leaves) and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+            raise ValueError(
+                "float64 arrays were given where JAX does not compute with them: call "
+                'jax.config.update("jax_enable_x64", True) first, or do this inside of jax.enable_x64(True)'
+            )
         native = TreeFunction(function, in_tree, shortcut, in_parts)
         out_leaves = _call_p.bind(*leaves, native=native, world_axes=0)
         return jax.tree.unflatten(_out_tree(native, _natural_signatures(leaves, 0)), out_leaves)
@@ -171,15 +176,21 @@ def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[An
     """
     del context
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in signatures]
-    # Behind `jit`, so that whoever calls the program binds one equation instead of each.
-    program, result = jax.make_jaxpr(jax.jit(lambda *args: native(*args)), return_shape=True)(*shapes)
+    # Constants have the precision of the arguments: float32 stays float32 where float64 is allowed.
+    with jax.enable_x64(_is_wide(dtype for _, dtype in signatures)):
+        # Behind `jit`, so that whoever calls the program binds one equation instead of each.
+        program, result = jax.make_jaxpr(jax.jit(lambda *args: native(*args)), return_shape=True)(*shapes)
     _known_out_tree(native, tuple((shape[:-1], dtype) for shape, dtype in signatures))[:] = [jax.tree.structure(result)]
     return program
 
 
+def _is_wide(types: Iterable[Any]) -> bool:
+    return any(dtype in (jnp.float64, jnp.int64) for dtype in types)
+
+
 def _trace_context() -> tuple[Any, ...]:
-    """Settings of JAX on which the program of a function depends."""
-    return jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
+    """Settings of JAX on which the program of a function depends, beside the types of its arguments."""
+    return (jax.config.jax_default_matmul_precision,)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @functools.lru_cache(maxsize=1024)

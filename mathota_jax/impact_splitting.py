@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -123,16 +124,17 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     kept = forces(model, problem, impulses)
     share = impact.time / whole.dt
     means = [kept[name] * share for name in _forces_of(scene)]
-    moved, added = lax.cond(
+    collision = lax.cond(
         impact.happens.any(),
         lambda moved: collisions.collide(whole, merge(scene, bodies, moved), moved, impact.happens, gravity(whole)),
-        lambda moved: (moved, [jnp.zeros_like(mean) for mean in means]),
+        lambda moved: collisions.nothing(scene, moved, means),
         moved,
     )
-    moved = _back(path, moved, delay)
-    new = new_state(scene, state, moved, kept, failed)
+    moved = _back(path, collision.moved, delay)
+    failures = [one for one in (failed, collision.failed) if one is not None]
+    new = new_state(scene, state, moved, kept, functools.reduce(jnp.maximum, failures) if failures else None)
     new = dataclasses.replace(new, applied_force=state.applied_force, applied_torque=state.applied_torque)
-    total = [old + mean + more for old, mean, more in zip(progress.forces, means, added, strict=True)]
+    total = [old + mean + more for old, mean, more in zip(progress.forces, means, collision.forces, strict=True)]
     after = _Progress(new, left - impact.time, progress.ended | ~impact.happens, total)
     return jax.tree.map(lambda old, new: jnp.where(progress.ended, old, new), progress, after)
 

@@ -78,8 +78,8 @@ class Options:
         0.1 %. Ten such sweeps take a step 1.3 times as long. Worlds in which a contact slides are solved by sweeps alone;
         absent in scenes that bounce, and where joints are solved beside the contacts.
       exact_joints: joints that are connected, trees and closed loops, are solved together, exactly, and closed at the
-        end of the step (not with `impact_events`). "pgs": contacts are solved with the joints held, so that a robot
-        stands on feet of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a
+        end of the step; with `impact_events` as by "converged". "pgs": contacts are solved with the joints held, so that a
+        robot stands on feet of any mass, where 192 rows suffice for motors, friction, stops and contacts, of those of a
         broadphase or of many pairs for what touches at a time, and there are no other joints. Elsewhere three and more
         joints, or fewer where a scene has nothing else to solve, or has springs or servos among several rows that drive
         them. "soft_step" sweeps joints in its small steps beside contacts, and closes them at the end. With the other
@@ -102,9 +102,10 @@ class Options:
         derivative, for a ball on a plane: its time is found in closed form, with the contact normal of the start of
         the step. Set it where bodies bounce off each other, off edges and corners or more often than once a step, or where
         their momenta, energy or derivatives must be exact: then they are, to round-off, at any time step. Followed are the
-        pairs that have contact slots of their own: up to 300 with "auto". Not with "soft_step", `continuous` or `sleep`. A
-        step without impact costs a look at its contacts more, one with k impacts k + 1 steps and k searches; a batch takes
-        as many parts as the world with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
+        pairs that have contact slots of their own: up to 300 with "auto". Where there are joints, all is solved as by
+        "converged", whatever the solver: an impact goes through all of them at once. Not with "soft_step", `continuous` or
+        `sleep`. A step without impact costs a look at its contacts more, one with k impacts k + 1 steps and k searches; a
+        batch takes as many parts as the world with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
       sleep: let islands of bodies at rest sleep until something disturbs them; off: absent. Guide 3.4 and 12.2. A body
         asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing. Changed
         leaves of the model, such as gravity, wake no one: see `wake`.

@@ -259,7 +259,7 @@ def _sweep(
     inertia: Inertia | None = None,
 ) -> tuple[Array, tuple[Array, ...], Array | None]:
     """All rows by the solver of the scene."""
-    if scene.options.solver == "converged":
+    if joint_layout.solves_together(scene):
         return converged.solve(rows, velocity, start)
     iterations = scene.options.velocity_iterations
     sweeps = 0 if known else iterations
@@ -326,7 +326,7 @@ def correct_positions(
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
-    if options.solver == "converged":
+    if joint_layout.solves_together(scene):
         correction = converged.solve(tuple(rows), zero, start)[0]
     else:
         iterations = options.position_iterations

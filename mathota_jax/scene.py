@@ -196,6 +196,11 @@ class Scene:
         """Whether the inertia of every moving body is the same about every axis: then nothing asks for principal axes."""
         return all(self.spherical[body] for body in self.dynamic_bodies)
 
+    @property
+    def splits_at_impacts(self) -> bool:
+        """Whether steps are split at their impacts."""
+        return bool(self.options.impact_events and self.restitution and self.pair_groups)
+
     @functools.cached_property
     def rebounds_may_gain(self) -> bool:
         """Whether anything bounces whose rebound may take more energy than the impact had.

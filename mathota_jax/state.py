@@ -146,11 +146,11 @@ def apply_force(state: State, body: int, force: Array, point: Array | None = Non
         several worlds.
     """
     check_handle("apply_force", state, body)
-    force = _vector("force", force)
+    force = _vector("force", force, state)
     applied = dataclasses.replace(state, applied_force=state.applied_force.at[body].add(force))
     if point is None:
         return applied
-    torque = jnp.cross(_vector("point", point) - state.position[body], force)
+    torque = jnp.cross(_vector("point", point, state) - state.position[body], force)
     return dataclasses.replace(applied, applied_torque=state.applied_torque.at[body].add(torque))
 
 
@@ -175,8 +175,9 @@ def check_handle(label: str, state: State, body: Any) -> None:
         raise ValueError(f"{label}: body must lie between 0 and {count - 1}, got {body!r}")
 
 
-def _vector(name: str, value: Array) -> Array:
-    value = jnp.asarray(value)
+def _vector(name: str, value: Array, state: State) -> Array:
+    """The value in the precision of the state."""
+    value = jnp.asarray(value, state.position.dtype)
     if value.shape != (3,):
         raise ValueError(f"apply_force: {name} must have shape (3,), got {value.shape}")
     return value

@@ -168,7 +168,7 @@ def _simulate_or_rest(model: Model, state: State, action: Array, solved: Solved 
 def _simulate(model: Model, state: State, action: Array, solved_before: Solved | None) -> tuple[State, Solved]:
     """The phases of a step."""
     scene = model.scene
-    if scene.options.impact_events and scene.restitution and scene.pair_groups:
+    if scene.splits_at_impacts:
         return split_at_impacts(model, state, action), Solved()
     bodies = materialize(unpack(state))
     if not scene.dynamic_bodies:

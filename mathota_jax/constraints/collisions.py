@@ -23,14 +23,15 @@ from mathota_jax.constraints import contact, joint
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.contact_force import slot_force
-from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables
+from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables, solves_together
 from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
 from mathota_jax.constraints.swept import misses, ways
 from mathota_jax.model import Model
-from mathota_jax.solver import pgs
+from mathota_jax.scene import Scene
+from mathota_jax.solver import converged, pgs
 from mathota_jax.solver.laws import Cone
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import (
@@ -181,7 +182,22 @@ def without(rows: Rows, dropped: Array) -> Rows:
     return dataclasses.replace(rows, law=law)
 
 
-def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity: Vec3) -> tuple[Bodies, list[Array]]:
+class Collision(NamedTuple):
+    """What a collision does.
+
+    Attributes:
+      moved: the moving bodies with their velocities after it.
+      forces: the impulses as mean forces over the whole step: those on the contact slots (slot, 3, world), then those of the
+        joint rows (slot, world) if there are joints.
+      failed: 1 for each world (world,) that was not solved; None from sweeps.
+    """
+
+    moved: Bodies
+    forces: list[Array]
+    failed: Array | None
+
+
+def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity: Vec3) -> Collision:
     """What approaches where it touches collides.
 
     Args:
@@ -189,10 +205,6 @@ def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity
       bodies, blocks: all bodies and the moving ones, where they meet, with their velocities before.
       chosen: (world,) worlds in which there is a collision.
       gravity: components (1, world).
-
-    Returns:
-      The moving bodies with their velocities after it, and the impulses as mean forces over the whole step: those on the
-      contact slots (slot, 3, world), then those of the joint rows (slot, world) if there are joints.
     """
     scene = model.scene
     pull = norm(gravity)
@@ -200,7 +212,8 @@ def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity
     active = contacts.active & chosen & _touch(model, bodies, contacts, pull)
     contacts = compute_once(contacts._replace(active=active), bodies.position.x)
     inertia = moving_inertia(scene, model, blocks.orientation)
-    velocity, held, groups, impulses = _rounds(model, bodies, blocks, inertia, contacts, gravity)
+    end, held, groups = _rounds(model, bodies, blocks, inertia, contacts, gravity)
+    velocity, impulses, failed = end
     linear, angular = unpack_blocks(velocity)
     moved = blocks._replace(velocity=linear)
     if angular is not None:
@@ -209,13 +222,27 @@ def collide(model: Model, bodies: Bodies, blocks: Bodies, chosen: Array, gravity
     if held:
         values = [impulse[:, 0] / model.dt for impulse in impulses[: len(held)]]
         forces.append(collect([rows.table for rows in held], values, joint_row_count(scene)))
-    return moved, forces
+    return Collision(moved, forces, failed)
+
+
+def nothing(scene: Scene, moved: Bodies, like: list[Array]) -> Collision:
+    """Where nothing collides; `like` is as the forces."""
+    failed = jnp.zeros_like(moved.position.x[0]) if solves_together(scene) else None
+    return Collision(moved, [jnp.zeros_like(force) for force in like], failed)
+
+
+class _Round(NamedTuple):
+    """Velocities (component, block, world) after a round, the impulses so far, and `Collision.failed`."""
+
+    velocity: Array
+    impulses: Impulses
+    failed: Array | None
 
 
 def _rounds(
     model: Model, bodies: Bodies, blocks: Bodies, inertia: Inertia, contacts: ContactSet, gravity: Vec3
-) -> tuple[Array, tuple[Rows, ...], list[ContactRows], Impulses]:
-    """Velocities (component, block, world) after all rounds, rows of joints and contacts, and the sum of the impulses."""
+) -> tuple[_Round, tuple[Rows, ...], list[ContactRows]]:
+    """The end of all rounds, and the rows of joints and contacts."""
     scene = model.scene
     pull = norm(gravity)
     before = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
@@ -233,8 +260,8 @@ def _rounds(
     bounce = [_restitution(model, group.rows, worlds) for group in groups]
     iterations = 4 * scene.options.velocity_iterations
 
-    def solve(state: tuple[Array, Impulses]) -> tuple[Array, Impulses]:
-        velocity, total = state
+    def solve(last: _Round) -> _Round:
+        velocity = last.velocity
         rows, rebounds = list(held), [jnp.zeros_like(row.bias) for row in held]
         for group, e in zip(groups, bounce, strict=True):
             speed = first_row_velocity(group.rows, velocity)
@@ -244,24 +271,29 @@ def _rounds(
             zero = jnp.zeros_like(chosen.bias)
             rebounds.append(jnp.concatenate([rebound, zero[:, 1:]], axis=1))
             rows.append(dataclasses.replace(chosen, bias=zero))
-        start = tuple(jnp.zeros_like(part) for part in total)
+        start = tuple(jnp.zeros_like(part) for part in last.impulses)
         gradient = pgs.gradient_sweeps(tuple(rows), iterations, scene.options.gradient_iterations)
 
-        def with_restitution(share: Array | float) -> Impulses:
+        def with_restitution(share: Array | float) -> tuple[Impulses, Array | None]:
             biased = tuple(
                 dataclasses.replace(row, bias=row.bias + share * rebound)
                 for row, rebound in zip(rows, rebounds, strict=True)
             )
-            return pgs.solve(iterations, gradient, biased, velocity, start, jnp.zeros_like(velocity))[1]
+            if solves_together(scene):
+                return converged.solve(biased, velocity, start)[1:]
+            return pgs.solve(iterations, gradient, biased, velocity, start, jnp.zeros_like(velocity))[1], None
 
         if scene.friction:
-            both = lax.map(with_restitution, jnp.array([0.0, 1.0], velocity.dtype))
+            both, failed = lax.map(with_restitution, jnp.array([0.0, 1.0], velocity.dtype))
             stopping, full = (tuple(part[k] for part in both) for k in range(2))
             impulses = _without_gain(tuple(rows), velocity, stopping, full)
+            failed = None if failed is None else failed.max(0)
         else:
-            impulses = with_restitution(1.0)
+            impulses, failed = with_restitution(1.0)
         velocity = add_impulses(tuple(rows), velocity, impulses)
-        return velocity, tuple(a + b for a, b in zip(total, impulses, strict=True))
+        if last.failed is not None and failed is not None:
+            failed = jnp.maximum(last.failed, failed)
+        return _Round(velocity, tuple(a + b for a, b in zip(last.impulses, impulses, strict=True)), failed)
 
     def approaches(velocity: Array) -> Array:
         going = jnp.asarray(False)
@@ -269,13 +301,13 @@ def _rounds(
             going = going | (_approach(group.rows, lax.stop_gradient(velocity)) > least).any()
         return going
 
-    def one_round(state: tuple[Array, Impulses], _: None) -> tuple[tuple[Array, Impulses], None]:
-        return lax.cond(approaches(state[0]), solve, lambda state: state, state), None
+    def one_round(last: _Round, _: None) -> tuple[_Round, None]:
+        return lax.cond(approaches(last.velocity), solve, lambda last: last, last), None
 
     everything = (*held, *(group.rows for group in groups))
     start = tuple(jnp.zeros((*rows.bias.shape[:-1], worlds), before.dtype) for rows in everything)
-    (velocity, impulses), _ = lax.scan(one_round, (before, start), None, length=ROUNDS)
-    return velocity, held, groups, impulses
+    begin = _Round(before, start, jnp.zeros(worlds, before.dtype) if solves_together(scene) else None)
+    return lax.scan(one_round, begin, None, length=ROUNDS)[0], held, groups
 
 
 def _without_gain(rows: tuple[Rows, ...], velocity: Array, stopping: Impulses, full: Impulses) -> Impulses:

@@ -22,7 +22,7 @@ from jax import Array
 
 from mathota_jax.constraints.assembly import Side
 from mathota_jax.constraints.effective_mass import step_length
-from mathota_jax.constraints.joint_layout import joint_groups
+from mathota_jax.constraints.joint_layout import joint_groups, solves_together
 from mathota_jax.constraints.mechanism_layout import held_slots, layout, takes_small_steps
 from mathota_jax.scene import Scene
 from mathota_jax.solver.table import EMPTY, Table
@@ -35,7 +35,7 @@ from mathota_jax.struct import pytree, static
 
 def applies(scene: Scene) -> bool:
     """Whether rows are decoupled: not where the step solves mechanisms exactly, or where no row is swept by itself."""
-    return scene.options.solver != "converged" and (layout(scene) is None or takes_small_steps(scene))
+    return not solves_together(scene) and (layout(scene) is None or takes_small_steps(scene))
 
 
 @pytree

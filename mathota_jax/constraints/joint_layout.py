@@ -67,6 +67,16 @@ def joint_row_count(scene: Scene) -> int:
     return sum(group.row_count * len(group.joints) for group in joint_groups(scene))
 
 
+def solves_together(scene: Scene) -> bool:
+    """Whether all rows of a scene are solved together, to round-off, instead of by sweeps.
+
+    Also where steps are split at their impacts and there are joints: sweeps carry an impact one joint a sweep, and the
+    forces of a step with an impact are no start for those of the next. Of a double pendulum that strikes the ground they
+    left out up to 0.4 of the change of its velocities.
+    """
+    return scene.options.solver == "converged" or (scene.splits_at_impacts and joint_row_count(scene) > 0)
+
+
 def most_joints_of_a_body(scene: Scene) -> np.ndarray:
     """(joint,) how many joints that of its moving bodies has which has most."""
     ends = [(joint.parent, joint.child) for joint in scene.joints]

@@ -231,11 +231,15 @@ def test_one_trace_serves_shapes_lowering_and_derivatives(program, traces):
 
 def test_another_precision_is_another_trace():
     wrapped = batch_last(lambda x: (x * 2, jnp.arange(3)[:, None] + jnp.zeros(x.shape[-1:], int)))
-    x = np.ones(3, np.float32)
-    for wide, expected in ((False, "int32"), (True, "int64"), (False, "int32")):
+    for wide, precision, whole in (
+        (False, "float32", "int32"),
+        (True, "float64", "int64"),
+        (True, "float32", "int32"),
+        (False, "float32", "int32"),
+    ):
         with jax.enable_x64(wide):
-            value, numbers = jax.vmap(wrapped)(x)
-            assert value.dtype == "float32" and numbers.dtype == expected
+            value, numbers = jax.vmap(wrapped)(np.ones(3, precision))
+            assert value.dtype == precision and numbers.dtype == whole
 
 
 def test_one_trace_serves_many_calls():
