@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 
 from mathota_jax.constraints.joints import JOINTS
-from mathota_jax.constraints.joints.kind import JointKind
+from mathota_jax.constraints.joints.kind import OUT_OF_REACH, JointKind
 from mathota_jax.declarations import Body, number, positive
 from mathota_jax.geometry.validation import finite_vector
 from mathota_jax.rotation import frame_with_axis, relative_rotation, rotate_back
-
-OUT_OF_REACH = 1e9
-"""Limit [m] and cap [N] that stand for none: an infinite one would turn into NaN in derivatives."""
 
 OPEN = np.asarray([-OUT_OF_REACH, OUT_OF_REACH])
 

@@ -63,8 +63,9 @@ class Hyperparameters:
 
     @property
     def rollout_length(self) -> int:
-        """Steps of each world in one update: enough for the samples, and divisible into equal minibatches."""
-        length = math.ceil(min(self.samples_per_update, self.steps) / self.worlds)
+        """Steps of each world in one update: enough for the samples, and divisible into minibatches of two or more."""
+        samples = max(min(self.samples_per_update, self.steps), 2 * self.minibatch_count)
+        length = math.ceil(samples / self.worlds)
         multiple = self.minibatch_count // math.gcd(self.worlds, self.minibatch_count)
         return math.ceil(length / multiple) * multiple
 

@@ -73,9 +73,10 @@ class Request:
     def hyperparameters(self) -> Hyperparameters | ShortHorizonHyperparameters:
         """The preset with the worlds and steps that were asked for."""
         asked = {name: getattr(self, name) for name in ("worlds", "steps") if getattr(self, name) is not None}
+        environment_id = self.environment_id.removeprefix("mathota_envs:")
         if self.backend == "gradient":
-            return replace(short_horizon_preset(self.environment_id), **asked)
-        return replace(preset(self.environment_id, self.backend), **asked)
+            return replace(short_horizon_preset(environment_id), **asked)
+        return replace(preset(environment_id, self.backend), **asked)
 
 
 @dataclass(frozen=True)

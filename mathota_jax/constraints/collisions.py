@@ -28,6 +28,7 @@ from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
+from mathota_jax.constraints.row_coefficients import row_coefficients
 from mathota_jax.constraints.swept import misses, ways
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
@@ -249,7 +250,8 @@ def _rounds(
     inverse = compute_once(inertia.inverse(), before)
     motion = contact.Motion(blocks.position, before, before, inverse, gravity)
     groups = [contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)]
-    held = _held(model, joint_rows(model, bodies), inertia, before) if joint_row_count(scene) else ()
+    joints = joint_rows(model, bodies) if joint_row_count(scene) else None
+    held = () if joints is None else _joint_rows(model, joints, inertia)
     fast = [_approach(group.rows, before) for group in groups]
     worlds = before.shape[-1]
     fastest = jnp.zeros((1, worlds), before.dtype)
@@ -262,7 +264,8 @@ def _rounds(
 
     def solve(last: _Round) -> _Round:
         velocity = last.velocity
-        rows, rebounds = list(held), [jnp.zeros_like(row.bias) for row in held]
+        rows = [] if joints is None else [_keeping_rates(row, joints, velocity) for row in held]
+        rebounds = [jnp.zeros_like(row.bias) for row in rows]
         for group, e in zip(groups, bounce, strict=True):
             speed = first_row_velocity(group.rows, velocity)
             rebound = jnp.where(_leaves(model, group, pull, e, speed, velocity), e * speed, 0.0)
@@ -364,17 +367,18 @@ def _touch(model: Model, bodies: Bodies, contacts: ContactSet, pull: Array) -> A
     return settle(jnp.where(meet(gap, size) | (rests & (gap <= TOUCHING * size)), 1.0, 0.0)) > 0.5
 
 
-def _held(model: Model, joints: JointRows, inertia: Inertia, velocity: Array) -> tuple[Rows, ...]:
-    """Rows of the joints during a collision: they keep their rates; a stop that is reached lets none pass."""
+def _joint_rows(model: Model, joints: JointRows, inertia: Inertia) -> tuple[Rows, ...]:
+    """Rows of the joints during a collision."""
     scene = model.scene
-    stops = (joints.laws == STOP)[:, None]
-    room = jnp.where(stops, jnp.maximum(joints.error, 0.0) / model.dt, 0.0)
-    found = []
-    for table in joint_tables(scene):
-        rows = joint.position_rows(scene, table, joints, room, inertia)
-        one_sided = select(table, jnp.broadcast_to(jnp.asarray(stops), joints.error.shape))
-        worlds = rows.bias.shape[-1]
-        one_sided = pack_scalars(table, [one_sided.astype(velocity.dtype)], worlds) > 0.5
-        rate = row_velocity(rows, velocity)
-        found.append(dataclasses.replace(rows, bias=jnp.where(one_sided, rows.bias, -rate)))
-    return tuple(found)
+    # Motors keep the rates that they have: what is told to them means nothing here.
+    nothing = jnp.zeros((len(scene.motors), 1), joints.error.dtype)
+    coefficients = row_coefficients(model, nothing, joints)
+    return tuple(joint.collision_rows(scene, table, joints, coefficients, inertia) for table in joint_tables(scene))
+
+
+def _keeping_rates(rows: Rows, joints: JointRows, velocity: Array) -> Rows:
+    """Rows of joints that keep the rates they have, or whose rotors do."""
+    worlds = velocity.shape[-1]
+    stops = jnp.broadcast_to(jnp.asarray(joints.laws == STOP, velocity.dtype)[:, None], joints.error.shape)
+    stops = pack_scalars(rows.table, [select(rows.table, stops)], worlds) > 0.5
+    return dataclasses.replace(rows, bias=jnp.where(stops, rows.bias, -row_velocity(rows, velocity)))

@@ -17,11 +17,12 @@ from mathota_jax.constraints.decoupling import Decoupling, decouple
 from mathota_jax.constraints.effective_mass import step_length
 from mathota_jax.constraints.joint_layout import child_moves
 from mathota_jax.constraints.joint_rows import JointRows
-from mathota_jax.constraints.joints.rows import STOP
+from mathota_jax.constraints.joints.kind import OUT_OF_REACH
+from mathota_jax.constraints.joints.rows import DRIVE, ELASTIC, HOLD, STOP
 from mathota_jax.constraints.mechanism_layout import bounded_slots
 from mathota_jax.constraints.mechanism_rows import Responses, felt_mass
 from mathota_jax.constraints.row_coefficients import Coefficients
-from mathota_jax.constraints.row_laws import CORRECTED, LAWS, Columns
+from mathota_jax.constraints.row_laws import CORRECTED, LAWS, LEAST, Columns
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver.laws import Bounded
@@ -32,6 +33,9 @@ from mathota_jax.spatial.indexing import take
 from mathota_jax.spatial.settle import store_cotangents
 from mathota_jax.spatial.spread import diagonal
 from mathota_jax.spatial.vector import where
+
+REACHED = 1e-5
+"""Room [m or rad] left before a stop at which it takes part in a collision."""
 
 
 class JointMotion(NamedTuple):
@@ -153,6 +157,32 @@ def position_rows(
     worlds = max(mass.shape[-1], error.shape[-1])
     bias, law = _position_laws(scene, table, joints, select(table, error), mass, worlds, left_out)
     return _pack(table, jacobians, responses, bias, law, worlds)
+
+
+def collision_rows(scene: Scene, table: Table, joints: JointRows, coefficients: Coefficients, inertia: Inertia) -> Rows:
+    """Rows of one table while bodies collide, in no time; their biases are left at 0.
+
+    What holds, and motors without a cap, keep their rates, rotors resist a change of theirs, and stops that are reached let
+    none pass. What acts by bounded forces does nothing.
+    """
+    jacobians, responses, mass = _sides(scene, table, joints, inertia)
+    laws = joints.laws[np.maximum(table.order, 0)][:, None]
+    none = jnp.zeros((1, 1), mass.dtype)
+    wanted = (joints.error, coefficients.get("armature", none), coefficients.get("cap", none))
+    error, armature, cap = (select(table, jnp.broadcast_to(v, joints.error.shape)) for v in wanted)
+    rotor = (laws == ELASTIC) & (mass * armature > LEAST)
+    softness = jnp.where(rotor, 1.0 / jnp.where(rotor, armature, 1.0), 0.0)
+    reached = (laws == STOP) & (error <= REACHED)
+    works = (laws == HOLD) | reached | rotor | ((laws == DRIVE) & (cap >= OUT_OF_REACH))
+    free = jnp.where(works, jnp.inf, 0.0)
+    worlds = max(mass.shape[-1], error.shape[-1])
+    law = Bounded(
+        effective_mass=pack_scalars(table, [jnp.where(works, 1.0 / (mass + softness), 0.0)], worlds),
+        softness=pack_scalars(table, [softness], worlds),
+        lower=pack_scalars(table, [jnp.where(laws == STOP, 0.0, -free)], worlds),
+        upper=pack_scalars(table, [free], worlds),
+    )
+    return _pack(table, jacobians, responses, jnp.zeros_like(mass), law, worlds)
 
 
 def decoupled_position_rows(scene: Scene, rows: Rows, decoupling: Decoupling, joints: JointRows, error: Array) -> Rows:

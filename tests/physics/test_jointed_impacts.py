@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Hinge, Plane, SceneBuilder, Sphere, energy, joint_gaps, step
+from mathota_jax import Box, Hinge, Plane, SceneBuilder, Slider, Sphere, energy, joint_gaps, step
 from tests.scenes import DOWN, GRAVITY, record_worlds, repeat, undamped
 
 LENGTH, RADIUS, HALF = 0.7, 0.1, (0.05, 0.3, 0.1)
@@ -142,3 +142,47 @@ def test_energy_of_elastic_bounces(float64, gate):
     assert not np.asarray(record["flags"]).any()
     gate("energy / that of a fall by a metre", (np.asarray(record["energy"]) - start) / ((ROD + TIP) * GRAVITY), 0.01)
     gate("joint gap [m]", record["gap"], 1e-3)
+
+
+CAPPED = {"motor_cap": 1e-9}
+CARRIAGES = {
+    "free": (1.0, CAPPED),
+    "with a rotor": (4.0, CAPPED | {"joint_armature": 3.0}),
+    "with a rotor and a spring": (4.0, CAPPED | {"joint_armature": 3.0, "joint_stiffness": 1e4}),
+    "held by a motor": (np.inf, {}),
+    "held by a motor as far as it can": (1.0, {"motor_cap": 100.0}),
+    "at its stop": (np.inf, CAPPED | {"joint_limits": (-1.0, 0.0)}),
+    "near its stop": (1.0, CAPPED | {"joint_limits": (-1.0, 1e-3)}),
+}
+"""The mass that takes part in an impact; leaves of the model. A bounded force does nothing in no time."""
+
+
+def test_carriages_that_are_struck(float64, gate):
+    """Of 1 kg, by a ball of 1 kg at 2 m/s: rotors count, motors without a cap hold, and so do stops that are reached.
+
+    Rotors and motors were ignored. Stops a way off held, against the rebound: impulses of 1e11 N s.
+    """
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    post = builder.add_body(Sphere(0.01), static=True, position=(0, 9, 0), collides=False)
+    carriage = builder.add_body(Box((0.1, 0.1, 0.1)), mass=1.0, restitution=0.5)
+    place = (-0.15 - 2e-6, 0, 0)
+    ball = builder.add_body(Sphere(0.05), mass=1.0, position=place, velocity=(2.0, 0, 0), restitution=0.5)
+    features = {"armature": 1e-9, "stiffness": 1e-9, "limits": (-1.0, 1.0)}
+    rail = builder.add_joint(Slider(post, carriage, (0, 0, 0), (1, 0, 0), **features))
+    builder.add_motor(rail, kind="velocity")
+    # In longer steps springs, motors and stops act after the impact, too.
+    model, state = builder.build(undamped(dt=2e-6, impact_events=1))
+
+    def changed(leaves):
+        return dataclasses.replace(
+            model, **{name: jnp.asarray(value, jnp.float64)[None] for name, value in leaves.items()}
+        )
+
+    models = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(changed(leaves) for _, leaves in CARRIAGES.values()))
+    after = jax.jit(jax.vmap(step, (0, None)))(models, state)
+    assert not np.asarray(after.flags).any()
+    for world, (name, (mass, _)) in enumerate(CARRIAGES.items()):
+        common = 2.0 / (1.0 + mass)
+        truth = [common * 1.5, common * 1.5 - 1.0]  # they part at half of the 2 m/s
+        gate(f"{name}: velocities", np.asarray(after.velocity)[world, [carriage, ball], 0] - truth, 1e-3)
+        gate(f"{name}: others", np.asarray(after.velocity)[world, [carriage, ball], 1:], 1e-9)

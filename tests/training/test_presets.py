@@ -6,6 +6,7 @@ import pytest
 
 from training.presets import PRESETS, Hyperparameters, preset
 from training.short_horizon_presets import SHORT_HORIZON_PRESETS, ShortHorizonHyperparameters, short_horizon_preset
+from training.train import Request
 
 
 @pytest.mark.parametrize("worlds", [1, 3, 32, 100, 5000])
@@ -14,6 +15,7 @@ def test_minibatches_divide_the_samples(worlds, steps):
     hyperparameters = Hyperparameters(worlds=worlds, steps=steps)
     samples = hyperparameters.rollout_length * worlds
     assert hyperparameters.minibatch_size * hyperparameters.minibatch_count == samples
+    assert hyperparameters.minibatch_size >= 2  # stable-baselines3 divides by their spread
     assert samples >= min(hyperparameters.samples_per_update, steps)
     assert hyperparameters.update_count * samples >= steps > (hyperparameters.update_count - 1) * samples
 
@@ -33,6 +35,14 @@ def test_minibatches_divide_the_samples(worlds, steps):
 def test_impossible_hyperparameters_are_named(name, value):
     with pytest.raises(ValueError, match=name):
         replace(Hyperparameters(), **{name: value})
+
+
+@pytest.mark.parametrize("backend", ["jax", "gradient"])
+def test_an_id_with_its_package_has_the_same_preset(backend):
+    plain, with_package = (
+        Request(prefix + "mathota/BallBalance-v0", backend).hyperparameters() for prefix in ("", "mathota_envs:")
+    )
+    assert plain == with_package
 
 
 def test_presets_name_known_environments_and_backends():

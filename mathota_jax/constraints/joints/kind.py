@@ -10,6 +10,9 @@ from jax import Array
 from mathota_jax.constraints.joints.frames import JointFrames
 from mathota_jax.constraints.joints.rows import JointRow, Sides
 
+OUT_OF_REACH = 1e9
+"""Limit [m] and cap [N] that stand for none: an infinite one would turn into NaN in derivatives."""
+
 
 class Coordinate(NamedTuple):
     """A scalar coordinate of a joint.
