@@ -184,8 +184,11 @@ def _traced(native: Native, signatures: tuple[Signature, ...], context: tuple[An
     return program
 
 
+_WIDE = (np.dtype("float64"), np.dtype("int64"))
+
+
 def _is_wide(types: Iterable[Any]) -> bool:
-    return any(dtype in (jnp.float64, jnp.int64) for dtype in types)
+    return any(dtype in _WIDE for dtype in types)
 
 
 def _trace_context() -> tuple[Any, ...]:

@@ -103,9 +103,10 @@ class Options:
         the step. Set it where bodies bounce off each other, off edges and corners or more often than once a step, or where
         their momenta, energy or derivatives must be exact: then they are, to round-off, at any time step. Followed are the
         pairs that have contact slots of their own: up to 300 with "auto". Where there are joints, all is solved as by
-        "converged", whatever the solver: an impact goes through all of them at once. Not with "soft_step", `continuous` or
-        `sleep`. A step without impact costs a look at its contacts more, one with k impacts k + 1 steps and k searches; a
-        batch takes as many parts as the world with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
+        "converged", whatever the solver: an impact goes through all of them at once, in which bounded forces (springs,
+        friction, motors with a cap) do nothing. Not with "soft_step", `continuous` or `sleep`. A step without impact costs
+        a look at its contacts more, one with k impacts k + 1 steps and k searches; a batch takes as many parts as the world
+        with most impacts. Compiling takes 3 times as long, with derivatives 5 times.
       sleep: let islands of bodies at rest sleep until something disturbs them; off: absent. Guide 3.4 and 12.2. A body
         asleep does not move at all, and a step in which every body of every world sleeps costs next to nothing. Changed
         leaves of the model, such as gravity, wake no one: see `wake`.

@@ -371,8 +371,8 @@ def _joint_rows(model: Model, joints: JointRows, inertia: Inertia) -> tuple[Rows
     """Rows of the joints during a collision."""
     scene = model.scene
     # Motors keep the rates that they have: what is told to them means nothing here.
-    nothing = jnp.zeros((len(scene.motors), 1), joints.error.dtype)
-    coefficients = row_coefficients(model, nothing, joints)
+    no_action = jnp.zeros((len(scene.motors), 1), joints.error.dtype)
+    coefficients = row_coefficients(model, no_action, joints)
     return tuple(joint.collision_rows(scene, table, joints, coefficients, inertia) for table in joint_tables(scene))
 
 
