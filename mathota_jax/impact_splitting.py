@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import jax
@@ -131,8 +130,9 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
         moved,
     )
     moved = _back(path, collision.moved, delay)
-    failures = [one for one in (failed, collision.failed) if one is not None]
-    new = new_state(scene, state, moved, kept, functools.reduce(jnp.maximum, failures) if failures else None)
+    if failed is not None and collision.failed is not None:
+        failed = jnp.maximum(failed, collision.failed)
+    new = new_state(scene, state, moved, kept, failed)
     new = dataclasses.replace(new, applied_force=state.applied_force, applied_torque=state.applied_torque)
     total = [old + mean + more for old, mean, more in zip(progress.forces, means, collision.forces, strict=True)]
     after = _Progress(new, left - impact.time, progress.ended | ~impact.happens, total)

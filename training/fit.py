@@ -143,7 +143,7 @@ def _run(options: argparse.Namespace) -> tuple[FitResult, Path]:
                 progress=progress,
             )
     except BaseException:
-        if not any(folder.iterdir()):
+        if options.output is None:
             folder.rmdir()
         raise
     write_report(folder / REPORT_FILE, result, f"Fit of {Path(options.data).name}")

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from mathota_envs import make
+from mathota_envs.registration import registered_id
 from mathota_jax import Model, State, contact_forces, contacts
 from training.evaluate import Evaluation, Evaluator
 from training.policies import save_policy
@@ -73,7 +74,7 @@ class Request:
     def hyperparameters(self) -> Hyperparameters | ShortHorizonHyperparameters:
         """The preset with the worlds and steps that were asked for."""
         asked = {name: getattr(self, name) for name in ("worlds", "steps") if getattr(self, name) is not None}
-        environment_id = self.environment_id.removeprefix("mathota_envs:")
+        environment_id = registered_id(self.environment_id)
         if self.backend == "gradient":
             return replace(short_horizon_preset(environment_id), **asked)
         return replace(preset(environment_id, self.backend), **asked)

@@ -28,7 +28,7 @@ def make(id: str, **options: Any) -> Environment:
     Raises:
         ValueError: the id or an option is unknown, or an option has an impossible value.
     """
-    environment_class = ENVIRONMENTS.get(id.removeprefix("mathota_envs:")) if isinstance(id, str) else None
+    environment_class = ENVIRONMENTS.get(registered_id(id)) if isinstance(id, str) else None
     if environment_class is None:
         raise ValueError(f"unknown environment {id!r}; known environments: {', '.join(ENVIRONMENTS)}")
     valid = option_names(environment_class)
@@ -36,6 +36,11 @@ def make(id: str, **options: Any) -> Environment:
         if name not in valid:
             raise ValueError(f"{id}: unknown option {name!r}; valid options: {', '.join(valid)}")
     return environment_class(**options)
+
+
+def registered_id(id: str) -> str:
+    """The id without the name of the package, which `gymnasium.make` imports."""
+    return id.removeprefix("mathota_envs:")
 
 
 def option_names(environment_class: type[Environment]) -> list[str]:

@@ -25,7 +25,6 @@ from mathota_jax.constraints.contact import ContactRows
 from mathota_jax.constraints.contact_force import slot_force
 from mathota_jax.constraints.joint_layout import joint_row_count, joint_tables, solves_together
 from mathota_jax.constraints.joint_rows import JointRows, joint_rows
-from mathota_jax.constraints.joints.rows import STOP
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
 from mathota_jax.constraints.row_coefficients import row_coefficients
@@ -33,7 +32,7 @@ from mathota_jax.constraints.swept import misses, ways
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs
-from mathota_jax.solver.laws import Cone
+from mathota_jax.solver.laws import Bounded, Cone
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import (
     Rows,
@@ -250,8 +249,7 @@ def _rounds(
     inverse = compute_once(inertia.inverse(), before)
     motion = contact.Motion(blocks.position, before, before, inverse, gravity)
     groups = [contact.contact_rows(scene, table, model, contacts, motion) for table in contact.contact_tables(scene)]
-    joints = joint_rows(model, bodies) if joint_row_count(scene) else None
-    held = () if joints is None else _joint_rows(model, joints, inertia)
+    held = _joint_rows(model, joint_rows(model, bodies), inertia) if joint_row_count(scene) else ()
     fast = [_approach(group.rows, before) for group in groups]
     worlds = before.shape[-1]
     fastest = jnp.zeros((1, worlds), before.dtype)
@@ -264,7 +262,7 @@ def _rounds(
 
     def solve(last: _Round) -> _Round:
         velocity = last.velocity
-        rows = [] if joints is None else [_keeping_rates(row, joints, velocity) for row in held]
+        rows = [_keeping_rates(row, velocity) for row in held]
         rebounds = [jnp.zeros_like(row.bias) for row in rows]
         for group, e in zip(groups, bounce, strict=True):
             speed = first_row_velocity(group.rows, velocity)
@@ -376,9 +374,7 @@ def _joint_rows(model: Model, joints: JointRows, inertia: Inertia) -> tuple[Rows
     return tuple(joint.collision_rows(scene, table, joints, coefficients, inertia) for table in joint_tables(scene))
 
 
-def _keeping_rates(rows: Rows, joints: JointRows, velocity: Array) -> Rows:
-    """Rows of joints that keep the rates they have, or whose rotors do."""
-    worlds = velocity.shape[-1]
-    stops = jnp.broadcast_to(jnp.asarray(joints.laws == STOP, velocity.dtype)[:, None], joints.error.shape)
-    stops = pack_scalars(rows.table, [select(rows.table, stops)], worlds) > 0.5
-    return dataclasses.replace(rows, bias=jnp.where(stops, rows.bias, -row_velocity(rows, velocity)))
+def _keeping_rates(rows: Rows, velocity: Array) -> Rows:
+    """Rows of joints that keep the rates they have, or whose rotors do; stops, which only push, let none pass."""
+    assert isinstance(rows.law, Bounded)
+    return dataclasses.replace(rows, bias=jnp.where(rows.law.lower < 0, -row_velocity(rows, velocity), 0.0))

@@ -235,8 +235,7 @@ def _solve(
         return _Search(_add(x, length, change), residual, way, going, count + 1)
 
     worlds = like.shape[-1]
-    zero = tuple(jnp.zeros((*side.shape[:-1], worlds), side.dtype) for side in right_sides)
-    right_sides = tuple(jnp.broadcast_to(side, none.shape) for side, none in zip(right_sides, zero, strict=True))
+    zero = tuple(jnp.zeros_like(side) for side in right_sides)
     nowhere = _Way(zero, zero, jnp.full(worlds, jnp.inf, like.dtype))
     start = _Search(zero, right_sides, nowhere, jnp.ones(worlds, bool), jnp.zeros((), jnp.int32))
     return lax.while_loop(lambda search: (search.count < ways.most) & search.going.any(), step, start).x
