@@ -6,9 +6,13 @@ consistent: many impulses, one velocity. ``A + delta`` is regular, and its inver
 
     (A + delta)^-1 = D + S J G^-1 M^-1 J^T D.
 
-Few steps along what this makes of the residual lead to a solution, whose velocity is the right one. A step along a mode of A
-of size s is wrong by delta / (delta + s), and by what round-off makes of S, which is large: the residual is found anew from
-A after each. Contacts of a single body have so few modes that the residuals themselves lead there.
+Few steps along what this makes of the residual lead to a solution, whose velocity is the right one. A step leaves of a mode
+of A of size s the share delta / (delta + s), and what round-off makes of S, which is large: the residual is found anew from
+A after each.
+
+Right sides may hold what no impulses answer to: sweeps end while all points of a face press, though their errors do not fit
+one another. It stays in the residual, and each step adds it, over delta, to impulses that change no normal velocity; where
+points slide in different directions, though, friction makes velocities of these. All of it is taken out in the end.
 """
 
 from __future__ import annotations
@@ -26,27 +30,27 @@ from mathota_jax.solver import velocity_system
 from mathota_jax.solver.laws import Law
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, visiting_all_turns
-from mathota_jax.solver.slopes import ConeSlopes, Slopes, left_unanswered, rates
+from mathota_jax.solver.slopes import Slopes, left_unanswered, rates
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import compute_once
 from mathota_jax.spatial.spread import add_all_slices
 
 STEPS, BODIES_A_STEP = 3, 2
-"""At least so many, and one for each so many bodies. Measured in float32: three leave residuals of 1e-6 for five boxes at
-rest and three that slide on one another, of 5e-4 for a cube of 100 times the mass on a cube (3e-5 with a step more); of a
-kick of ten stacked boxes three leave 0.13, five 6e-5."""
-
-STEPS_ALONG, NOISE = 40, 16.0
-"""Contacts of a single body: at most so many steps along the residuals themselves, as long as a world has one above so many
-round-offs of the right side that still falls. A slab that slides takes eight. Measured for boxes that tumble on a plane, 60
-steps, forward mode, three quarters of 24 worlds beside the limit of many steps: seven steps leave 4e-2 in float32 and
-sixteen 6e-3 in float64, these 2e-4 and 1e-7."""
+"""So many steps are taken unless nothing is left before, and at most three times as many, or three for each so many bodies.
+Measured for kicks of stacked cubes: five bodies need four in float32 and eight in float64, ten six in float32."""
 
 DELTA = 1e-3
 """Beside 1; in float32 round-off makes the first step wrong by some 1e-7 over its square. In float64 it could be less, were
 the rows of points that slide as redundant as they should be: where gaps of 1e-6 m do not fit one another, impulses take what
 does not fit over delta, and friction makes velocities of them. With 1e-6 a ball that slides on a sliding box had derivatives
 of 100 by the height of the box (0.56 in truth, 0.68 with 1e-3)."""
+
+NOISE = 16.0
+"""Round-offs of the right side above which a residual is worth a step."""
+
+LEAST_FALL = 0.2
+"""Of the square of the residual, for more than `STEPS` steps. Where all that is left is what nothing answers to, round-off
+makes ways of it: their lengths would be 1e3 to 1e6."""
 
 LEAST_EFFECT = 1e-5
 """Of a way, beside its size, for its length to be the one that leaves the least residual. What is left in the end is what no
@@ -117,23 +121,13 @@ class _System:
             for part, (by_impulse, _), group in zip(x, both, self.swapped, strict=True)
         )
 
-    def way(self) -> _Ways:
+    def way(self) -> Callable[[Impulses], Impulses]:
         """Where residuals lead."""
-        return _ALONG if self.is_single else _Ways(functools.partial(self.nearly, self.inverse()), self.steps)
+        return functools.partial(self.nearly, self.inverse())
 
-    def way_back(self) -> _Ways:
+    def way_back(self) -> Callable[[Impulses], Impulses]:
         """Where those of the transposed system do."""
-        return _ALONG if self.is_single else _Ways(functools.partial(self.nearly_back, self.inverse()), self.steps)
-
-    @property
-    def is_single(self) -> bool:
-        """Whether contacts act on a single body, and nothing else does."""
-        return self.nothing.shape[1] == 1 and all(isinstance(slope, ConeSlopes) for slope in self.slopes)
-
-    @property
-    def steps(self) -> int:
-        """How many of what is nearly the inverse lead from nothing to the solution."""
-        return max(STEPS, -(-self.nothing.shape[1] // BODIES_A_STEP))
+        return functools.partial(self.nearly_back, self.inverse())
 
     def inverse(self) -> velocity_system.Inverse:
         """``G^-1``."""
@@ -167,22 +161,13 @@ class _System:
         return slope.resolve(slope.update(jnp.zeros_like(error), error), DELTA)
 
 
-class _Ways(NamedTuple):
-    """Where a residual leads, None for along itself as long as that helps, and how many steps are taken at most."""
-
-    way: Callable[[Impulses], Impulses] | None
-    most: int
-
-
-_ALONG = _Ways(None, STEPS_ALONG)
-
-
 class _Way(NamedTuple):
-    """A change of the impulses, its product, and the square of that."""
+    """A change of the impulses, its product, the square of that, and the change for each part of what nothing answers to."""
 
     change: Impulses
     effect: Impulses
     square: Array
+    unanswered: Array
 
 
 class _Search(NamedTuple):
@@ -191,6 +176,7 @@ class _Search(NamedTuple):
     Attributes:
       x, residual: impulses and what they leave.
       last: way of the last step.
+      unanswered: (world,) how often the impulses hold the way of what nothing answers to.
       going: (world,) whether the residual is above round-off and still falls.
       count: () steps.
     """
@@ -198,12 +184,17 @@ class _Search(NamedTuple):
     x: Impulses
     residual: Impulses
     last: _Way
+    unanswered: Array
     going: Array
     count: Array
 
 
 def _solve(
-    ways: _Ways, product: Callable[[Impulses], Impulses], weights: Impulses, right_sides: Impulses, like: Array
+    way: Callable[[Impulses], Impulses],
+    product: Callable[[Impulses], Impulses],
+    weights: Impulses,
+    right_sides: Impulses,
+    like: Array,
 ) -> Impulses:
     """Solves ``product(x) = right sides`` by steps along the ways of the residuals.
 
@@ -215,30 +206,35 @@ def _solve(
         terms = (add_all_slices(w * x * y) for w, x, y in zip(weights, a, b, strict=True))
         return compute_once(functools.reduce(jnp.add, terms), like)
 
-    enough = (NOISE * float(jnp.finfo(like.dtype).eps)) ** 2 * dot(right_sides, right_sides)
+    size = dot(right_sides, right_sides)
+    enough = (NOISE * float(jnp.finfo(like.dtype).eps)) ** 2 * size
 
     def step(search: _Search) -> _Search:
-        x, residual, last, going, count = search
-        change = compute_once(residual if ways.way is None else ways.way(residual), like)
+        x, residual, last, unanswered, going, count = search
+        change = compute_once(way(residual), like)
         effect = compute_once(product(change), like)
         share = -dot(effect, last.effect) / last.square
         change = compute_once(_add(change, share, last.change), like)
         effect = compute_once(_add(effect, share, last.effect), like)
         square, along = dot(effect, effect), dot(effect, residual)
-        # Where a way does next to nothing, and where the residual would have to grow: along these nothing, else as they are.
-        falls = going & (square > LEAST_EFFECT**2 * dot(change, change)) & (along > 0)
-        length = jnp.where(falls, along / jnp.where(falls, square, 1.0), 0.0 if ways.way is None else 1.0)
+        acts = (square > LEAST_EFFECT**2 * dot(change, change)) & (along > 0)
+        best = along / jnp.where(acts, square, 1.0)
+        falls = going & acts & (best * along > LEAST_FALL * dot(residual, residual))
+        plain = going & (count < STEPS)
+        length = jnp.where(falls, best, jnp.where(plain, 1.0, 0.0))
         residual = compute_once(_add(residual, -length, effect), like)
-        way = _Way(change, effect, jnp.where(falls, square, jnp.inf))
-        if ways.way is None:
-            going = falls & (dot(residual, residual) > enough)
-        return _Search(_add(x, length, change), residual, way, going, count + 1)
+        held = 1.0 + share * last.unanswered
+        last = _Way(change, effect, jnp.where(falls, square, jnp.inf), held)
+        going = (falls | plain) & (dot(residual, residual) > enough)
+        return _Search(_add(x, length, change), residual, last, unanswered + length * held, going, count + 1)
 
-    worlds = like.shape[-1]
     zero = tuple(jnp.zeros_like(side) for side in right_sides)
-    nowhere = _Way(zero, zero, jnp.full(worlds, jnp.inf, like.dtype))
-    start = _Search(zero, right_sides, nowhere, jnp.ones(worlds, bool), jnp.zeros((), jnp.int32))
-    return lax.while_loop(lambda search: (search.count < ways.most) & search.going.any(), step, start).x
+    none = jnp.zeros(like.shape[-1], like.dtype)
+    nowhere = _Way(zero, zero, none + jnp.inf, none)
+    start = _Search(zero, right_sides, nowhere, none, size > 0, jnp.zeros((), jnp.int32))
+    most = 3 * max(STEPS, -(-like.shape[1] // BODIES_A_STEP))
+    found = lax.while_loop(lambda search: (search.count < most) & search.going.any(), step, start)
+    return _add(found.x, -found.unanswered, way(found.residual))
 
 
 def _add(a: Impulses, factor: Array, b: Impulses) -> Impulses:

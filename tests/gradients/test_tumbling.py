@@ -7,17 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mathota_jax import Box, Plane, SceneBuilder, rollout
+from mathota_jax import Box, Plane, SceneBuilder, Sphere, rollout
 from tests.scenes import DOWN, undamped
 
 WORLDS, STEPS = 24, 60
 
 
-def tumbling():
-    """Boxes that drop from 2 cm above the ground, turned and spinning."""
+def tumbling(company=False):
+    """Boxes that drop from 2 cm above the ground, turned and spinning; in company, beside a ball that rests far away."""
     builder = SceneBuilder(gravity=DOWN)
     builder.add_body(Plane((0, 1, 0)), static=True, friction=0.45)
     builder.add_body(Box((0.1, 0.13, 0.08)), mass=1.3, position=(0, 0.2, 0), friction=0.45)
+    if company:
+        builder.add_body(Sphere(0.1), mass=1.0, position=(5, 0.1, 0), friction=0.45)
     model, state = builder.build(undamped(dt=1 / 120))
     rng = np.random.default_rng(1)
     turns = rng.normal(size=(WORLDS, 4))
@@ -44,26 +46,39 @@ def final(model, state, change):
     return jnp.stack([end.position[1], 0.1 * end.velocity[1]])
 
 
-def slopes(precision):
+def slopes(precision, company=False):
     """(world, change, 2, 3) derivatives in forward mode."""
     with jax.enable_x64(precision == "float64"):
-        model, states = tumbling()
+        model, states = tumbling(company)
         of_world = jax.vmap(lambda state: jax.jacfwd(lambda change: final(model, state, change))(jnp.zeros(5)))
         return np.moveaxis(np.asarray(jax.jit(of_world)(states), float), -1, 1)
 
 
-def test_float32_says_what_float64_says(gate):
-    """States differ by 1e-5. With seven steps of the linear solver a quarter of the derivatives was off by 4 % and more."""
-    truth = slopes("float64")
+def difference(found, truth):
+    """(world, change) beside the truth, where that is not next to nothing."""
     size = np.abs(truth).max((2, 3))
-    off = np.abs(slopes("float32") - truth).max((2, 3)) / np.maximum(size, 1e-3 * size.max(1, keepdims=True))
+    return np.abs(found - truth).max((2, 3)) / np.maximum(size, 1e-3 * size.max(1, keepdims=True))
+
+
+@pytest.mark.parametrize("company", [pytest.param(False, marks=pytest.mark.slow), True], ids=["alone", "in company"])
+def test_float32_says_what_float64_says(gate, company):
+    """States differ by 1e-5. Seven steps of a linear solver left a quarter of the derivatives off by 4 % and more."""
+    off = difference(slopes("float32", company), slopes("float64", company))
     gate("three of four derivatives", np.quantile(off, 0.75), 2e-3)
     gate("nine of ten", np.quantile(off, 0.9), 0.02)
 
 
 @pytest.mark.slow
+def test_company_changes_nothing(gate):
+    """A quarter was several times as large, by what no impulses answer to. Sweeps over more bodies end elsewhere: 1e-4."""
+    off = difference(slopes("float64", company=True), slopes("float64"))
+    gate("half of the derivatives", np.quantile(off, 0.5), 0.03)
+    gate("three of four", np.quantile(off, 0.75), 0.08)
+
+
+@pytest.mark.slow
 def test_both_modes_agree(precision, gate):
-    """``u . (J v) = (J^T u) . v``, as far as there is one way to share a load: where faces slide they differ by 5 %."""
+    """``u . (J v) = (J^T u) . v``. They differed by 5 % where each shared loads in a way of its own."""
     model, states = tumbling()
     rng = np.random.default_rng(2)
     v = jnp.asarray(rng.normal(size=5) * [1.0, 0.3, 1.0, 1.0, 1.0], precision)
@@ -76,6 +91,6 @@ def test_both_modes_agree(precision, gate):
         return forward, jnp.vdot(back, v), jnp.abs(back * v).max()
 
     forward, back, size = (np.asarray(part, float) for part in jax.jit(jax.vmap(both))(states))
-    difference = np.abs(forward - back) / size
-    gate("half of the worlds", np.median(difference), 1e-3)
-    gate("all", difference, 0.06)
+    off = np.abs(forward - back) / size
+    gate("half of the worlds", np.median(off), 1e-4)
+    gate("all", off, 2e-3)
