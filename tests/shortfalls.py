@@ -21,9 +21,6 @@ SHORTFALLS: dict[str, str] = {
             ("no joint, 30 and 100 s", "float64", "beside one that falls", 516),
         )
     },
-    "tests/gradients/test_method_agreement.py::test_a_pushed_stack": "converged solver, five boxes, the top one pushed by "
-    "8 N: 2.8e-5 off its differences, gate 1e-5 (with 1 N at most 7.4e-7). Three steps of the linear solver, whose "
-    "regularization is 1e-3 since smaller ones made derivatives of 100 where a ball slides on a sliding box",
     "tests/unit/test_convex.py::test_many_random_poses[float64-cone_cone]": "one of 952 poses, half overlapped, ends in a "
     "local minimum of the depth 4.3e-3 of the size too deep (flagged, as 2 % of the deep ones are); in float32 none",
 }

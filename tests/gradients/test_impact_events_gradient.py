@@ -130,6 +130,7 @@ def test_bounces_in_reverse_mode(precision, count, gate):
                 np.testing.assert_allclose(exact_slopes[name], UNDER_GRAVITY[name], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_bodies_that_land_at_once_have_derivatives_of_their_own(float64, gate):
     """Two balls far apart: each as if it were alone. Both had the derivative of one and the same time of impact."""
     surface = {"restitution": 0.7, "friction": 0.3}

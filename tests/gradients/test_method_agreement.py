@@ -57,6 +57,7 @@ def pushed(model, state, push):
     return jax.jacfwd(after, argnums=(0, 1), has_aux=True)(state.velocity[1], state.angular_velocity[1])
 
 
+@pytest.mark.slow
 def test_few_sweeps_behind_a_derivative_are_enough(float64, gate):
     """As many linear sweeps as scenes of many bodies have, and the limit of many more, against the dense system of the
     default, where a slab sticks and where it slips.

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Options, Plane, SceneBuilder, Sphere, rollout
-from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN
 
 STEPS, SETTLING = 30, 20
@@ -32,8 +31,8 @@ def loss_of(model, state, of_box):
     return final.position[-1, 0] + 0.1 * final.velocity[-1, 0]
 
 
-@pytest.mark.parametrize("solver", ["pgs", pytest.param("converged", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["pgs", "converged"])
 def test_modes_agree_where_all_just_touches(precision, solver, gate):
     """By all of the motion of the box. In float32 forward mode said -132 by a turn, the converged solver 1290."""
     del precision

@@ -42,7 +42,7 @@ def two_cubes(ratio):
 @pytest.mark.parametrize(
     ("precision", "dt"),
     [
-        ("float32", 1e-3),
+        pytest.param("float32", 1e-3, marks=pytest.mark.slow),
         ("float32", 1 / 60),
         pytest.param("float64", 1e-3, marks=pytest.mark.slow),
         ("float64", 1 / 60),
@@ -177,6 +177,7 @@ def test_scenes_with_a_broadphase(float64, gate):
     assert float(jnp.abs(finals[0].velocity).max()) > 1e-2
 
 
+@pytest.mark.slow
 def test_boxes_that_could_rebound_come_to_rest(float64, gate):
     """At rest from the start with a high restitution, and dropped with a low one: they shook for ever, at up to 0.06 m/s."""
 

@@ -160,6 +160,7 @@ def test_corner_of_a_spinning_box(float64, gate):
         gate("vertical angular momentum", angular_momentum(model, final)[1] - angular_momentum(model, state)[1], 1e-12)
 
 
+@pytest.mark.slow
 def test_a_ball_that_leaves_out_of_an_overlap(float64, gate):
     """Thrown up from inside of the plane it returns to the surface, or, where it never gets there, to where it was.
 

@@ -157,6 +157,7 @@ CARRIAGES = {
 """The mass that takes part in an impact; leaves of the model. A bounded force does nothing in no time."""
 
 
+@pytest.mark.slow
 def test_carriages_that_are_struck(float64, gate):
     """Of 1 kg, by a ball of 1 kg at 2 m/s: rotors count, motors without a cap hold, and so do stops that are reached.
 

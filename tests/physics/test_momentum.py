@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Capsule, SceneBuilder, Sphere
+from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import invariants, motion, per_body, record_worlds, repeat, undamped
 
 WORLDS = 12
@@ -43,6 +44,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in SCENES if name !=
 
 
 @pytest.mark.parametrize("name", ["spheres", *SLOW])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 def test_collisions_keep_the_invariants(precision, name, gate):
     model, models, states = colliding_worlds(SCENES[name], seed=1)
     _, record = record_worlds(models, states, 240, motion)

@@ -92,6 +92,7 @@ def test_a_world_asleep_does_not_change_a_bit(precision):
     assert force[:, 1].max() > 0.7 * GRAVITY, "the lowest box stands on four points with three weights"
 
 
+@pytest.mark.slow
 def test_the_whole_island_sleeps_at_once():
     model, state = two_stacks()
     _, record = run(model, state, 90)
@@ -131,6 +132,7 @@ def test_a_contact_wakes_the_island_and_no_other():
     np.testing.assert_array_equal(record.position[-1, 3:5], state.position[3:5])
 
 
+@pytest.mark.slow
 def test_a_force_wakes(gate):
     model, state = asleep()
     pushed = jax.jit(step)(model, apply_force(state, 2, jnp.array([0.0, 30.0, 0.0])))

@@ -110,6 +110,7 @@ def pincers(options):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_pincers_press_with_the_torque_of_their_motors(precision, gate):
     """Torques of 3 and -3 N m press tips 0.4 m from their hinges with 7.5 N; neither moves."""
     model, state = pincers(close())

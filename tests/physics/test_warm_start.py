@@ -79,6 +79,7 @@ def test_changing_the_time_step_does_not_kick(precision, gate):
 
 
 @pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.slow
 def test_teleporting_out_and_back_does_not_kick(precision, gate):
     model, state = boxes()
     settled = advance(model, state, 120)

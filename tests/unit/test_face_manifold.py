@@ -18,7 +18,7 @@ from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.quaternion import Quaternion, normalize, to_matrix
 from mathota_jax.spatial.vector import Vec3
 from tests.hulls import BOX_CORNERS, hull, point_to_hull
-from tests.marks import QUICK_IN_FLOAT64
+from tests.marks import QUICK_AND_SLOW_PRECISION, QUICK_IN_FLOAT64, slow_but
 
 COUNT = 64
 HEXAGON = np.array([[np.cos(a), y, np.sin(a)] for a in np.arange(6) * np.pi / 3 + 0.2 for y in (-1, 1)]) * 0.5
@@ -568,7 +568,14 @@ def test_sliding_many_corners_keeps_the_base(name, float64):
     assert np.abs(np.diff(areas)).max() < 0.15 * max(areas)
 
 
-@pytest.mark.parametrize("name", ["box", "polyhedral box", "hexagonal prism", "cylinder", "cone", "capsule"])
+@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
+@pytest.mark.parametrize(
+    "name",
+    slow_but(
+        ("box", "hexagonal prism", "cylinder"),
+        ("box", "polyhedral box", "hexagonal prism", "cylinder", "cone", "capsule"),
+    ),
+)
 def test_features_persist_in_a_tremor(name, precision):
     """A body at rest trembles by round-off: about 1e-6 rad in float32."""
     shape, pose, _, _ = POSES[name]

@@ -129,7 +129,7 @@ def thrown(state, kind, count=64):
     )
 
 
-@pytest.mark.parametrize("kind", ["sphere", "box"])
+@pytest.mark.parametrize("kind", slow_but(("sphere",), ("sphere", "box")))
 def test_what_comes_from_beside_rebounds(kind, float64, gate):
     """It went through the border, was lifted over it and left with up to 6 J more than it had."""
     lost = []

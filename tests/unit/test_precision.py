@@ -11,6 +11,7 @@ import pytest
 import mathota_jax as mj
 from mathota_jax import Box, Capsule, Hinge, Options, Plane, SceneBuilder, Slider, Sphere, rollout, step
 from mathota_jax.gradients import long_rollout, smoothed_step
+from tests.marks import slow_but
 from tests.scenes import box_stack
 
 OPTIONS = {
@@ -52,7 +53,7 @@ def wide_leaves(tree):
     ]
 
 
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize("name", slow_but(("default", "events", "soft_step", "converged"), OPTIONS))
 def test_steps_in_float32_where_float64_is_allowed(name):
     model, state = scene(**OPTIONS[name])
     with jax.enable_x64(True):

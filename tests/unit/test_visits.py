@@ -109,7 +109,7 @@ def forget_traces():
     jax.clear_caches()
 
 
-@pytest.mark.parametrize("name", slow_but(("box", "boxes by places along directions"), SCENES))
+@pytest.mark.parametrize("name", slow_but(("box",), SCENES))
 def test_a_step_is_the_same(name, make_for_gpu, gate):
     model, speeds, move = motion(name)
     expected = jax.jit(move)(model, speeds)
