@@ -83,13 +83,19 @@ def solve(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], right_sides: Impul
     everywhere = visiting_all_turns(rows)  # the product is transposed
     product = functools.partial(left_unanswered, everywhere, slopes, system.nothing)
     masses = tuple(slope.masses for slope in slopes)
+    at_bounds = tuple(
+        (mass == 0).astype(mass.dtype) for mass in masses
+    )  # rows without a mass count, too: caps of motors
 
     def solve_forward(_: object, right_sides: Impulses) -> Impulses:
-        weights = tuple(safe_divide(jnp.ones_like(mass), mass) for mass in masses)
+        weights = tuple(
+            safe_divide(jnp.ones_like(mass), mass) + own for mass, own in zip(masses, at_bounds, strict=True)
+        )
         return _solve(system.way(), system.product, weights, right_sides, system.nothing)
 
     def solve_transposed(_: object, right_sides: Impulses) -> Impulses:
-        return _solve(system.way_back(), system.product_back, masses, right_sides, system.nothing)
+        weights = tuple(mass + own for mass, own in zip(masses, at_bounds, strict=True))
+        return _solve(system.way_back(), system.product_back, weights, right_sides, system.nothing)
 
     return lax.custom_linear_solve(product, right_sides, solve_forward, transpose_solve=solve_transposed)
 

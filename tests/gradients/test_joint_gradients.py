@@ -96,6 +96,29 @@ def test_pendulum_by_its_parameters(float64, gate, mode):
     gate("the other pendulum", np.concatenate([by_spring[1], by_servo[0]]), 1e-12)
 
 
+@pytest.mark.parametrize("solver", slow_but(("pgs",), ("pgs", "converged")))
+@pytest.mark.parametrize("mode", slow_but((jax.jacfwd,), (jax.jacfwd, jax.jacrev)))
+def test_a_motor_at_its_cap(float64, gate, mode, solver):
+    """The rate after a step from rest is ``cap dt / I``: by the cap it grows by ``dt / I``, by the step by ``cap / I``.
+
+    No other row changes with a cap, and the row of a motor at its cap has no slope: the system took it for nothing.
+    """
+    cap, dt, inertia = 2.0, 1 / 100, MASS * (HALF[0] ** 2 + HALF[1] ** 2) / 3
+    builder = SceneBuilder(gravity=(0, 0, 0))
+    post = builder.add_body(Sphere(0.02), static=True, collides=False)
+    joint = builder.add_joint(Hinge(post, builder.add_body(Box(HALF), mass=MASS, collides=False), (0, 0, 0), (0, 0, 1)))
+    builder.add_motor(joint, kind="velocity", cap=cap, gear=50.0)
+    model, state = builder.build(undamped(dt=dt, solver=solver))
+
+    def rate(cap, dt):
+        changed = dataclasses.replace(model, motor_cap=cap[None], dt=dt)
+        return step(changed, state, jnp.ones(1)).angular_velocity[1, 2]
+
+    by_cap, by_dt = jax.jit(mode(rate, (0, 1)))(jnp.asarray(cap), jnp.asarray(dt))
+    gate("by the cap / truth - 1", by_cap / (dt / inertia) - 1, 1e-8)
+    gate("by the step / truth - 1", by_dt / (cap / inertia) - 1, 1e-8)
+
+
 def every_joint():
     """Each kind with all that it can have, at rest at its built pose: at stops, slack springs, coincident axes."""
     builder = SceneBuilder()
