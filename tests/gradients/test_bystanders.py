@@ -55,6 +55,7 @@ def test_one_bounce(precision, gate):
 
 
 @PRECISIONS
+@pytest.mark.slow
 def test_several_bounces(precision, gate):
     """All in one program: steps of 1/240 s for the longest."""
     for bounces, time, height, by_restitution, by_drop in SEVERAL_BOUNCES:

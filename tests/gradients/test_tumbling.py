@@ -14,12 +14,12 @@ WORLDS, STEPS = 24, 60
 
 
 def tumbling(company=False):
-    """Boxes that drop from 2 cm above the ground, turned and spinning; in company, beside a ball that rests far away."""
+    """Boxes that drop from 2 cm above the ground, turned and spinning; in company, beside a ball that flies."""
     builder = SceneBuilder(gravity=DOWN)
     builder.add_body(Plane((0, 1, 0)), static=True, friction=0.45)
     builder.add_body(Box((0.1, 0.13, 0.08)), mass=1.3, position=(0, 0.2, 0), friction=0.45)
     if company:
-        builder.add_body(Sphere(0.1), mass=1.0, position=(5, 0.1, 0), friction=0.45)
+        builder.add_body(Sphere(0.1), mass=1.0, position=(5, 5, 0), collides=False)
     model, state = builder.build(undamped(dt=1 / 120))
     rng = np.random.default_rng(1)
     turns = rng.normal(size=(WORLDS, 4))
@@ -60,7 +60,8 @@ def difference(found, truth):
     return np.abs(found - truth).max((2, 3)) / np.maximum(size, 1e-3 * size.max(1, keepdims=True))
 
 
-@pytest.mark.parametrize("company", [pytest.param(False, marks=pytest.mark.slow), True], ids=["alone", "in company"])
+@pytest.mark.slow
+@pytest.mark.parametrize("company", [False, True], ids=["alone", "in company"])
 def test_float32_says_what_float64_says(gate, company):
     """States differ by 1e-5. Seven steps of a linear solver left a quarter of the derivatives off by 4 % and more."""
     off = difference(slopes("float32", company), slopes("float64", company))
@@ -68,12 +69,10 @@ def test_float32_says_what_float64_says(gate, company):
     gate("nine of ten", np.quantile(off, 0.9), 0.02)
 
 
-@pytest.mark.slow
 def test_company_changes_nothing(gate):
-    """A quarter was several times as large, by what no impulses answer to. Sweeps over more bodies end elsewhere: 1e-4."""
+    """One in four was off by a third and more, by what no impulses answer to."""
     off = difference(slopes("float64", company=True), slopes("float64"))
-    gate("half of the derivatives", np.quantile(off, 0.5), 0.03)
-    gate("three of four", np.quantile(off, 0.75), 0.08)
+    gate("three of four derivatives", np.quantile(off, 0.75), 1e-9)
 
 
 @pytest.mark.slow
