@@ -50,8 +50,8 @@ NOISE = 16.0
 """Round-offs of the right side above which a residual is worth a step."""
 
 LEAST_FALL = 0.2
-"""Of the square of the residual, for more steps than those. Where all that is left is what nothing answers to, round-off
-makes ways of it: their lengths would be 1e3 to 1e6."""
+"""Of the square of the residual, for more steps than are taken in any case. Where all that is left is what nothing answers
+to, round-off makes ways of it: their lengths would be 1e3 to 1e6."""
 
 LEAST_EFFECT = 1e-5
 """Of a way, beside its size, for its length to be the one that leaves the least residual. What is left in the end is what no
@@ -87,10 +87,12 @@ def solve(rows: tuple[Rows, ...], slopes: tuple[Slopes, ...], right_sides: Impul
 
     def solve_forward(_: object, right_sides: Impulses) -> Impulses:
         weights = tuple(safe_divide(jnp.ones_like(mass), mass) for mass in masses)
-        return _solve(system.way(), system.product, weights, right_sides, system.nothing)
+        way = functools.partial(system.nearly, system.inverse())
+        return _solve(way, system.product, weights, right_sides, system.nothing)
 
     def solve_transposed(_: object, right_sides: Impulses) -> Impulses:
-        return _solve(system.way_back(), system.product_back, masses, right_sides, system.nothing)
+        way = functools.partial(system.nearly_back, system.inverse())
+        return _solve(way, system.product_back, masses, right_sides, system.nothing)
 
     return lax.custom_linear_solve(product, right_sides, solve_forward, transpose_solve=solve_transposed)
 
@@ -121,14 +123,6 @@ class _System:
             part - by_impulse - rates(group, velocity)
             for part, (by_impulse, _), group in zip(x, both, self.swapped, strict=True)
         )
-
-    def way(self) -> Callable[[Impulses], Impulses]:
-        """Where residuals lead."""
-        return functools.partial(self.nearly, self.inverse())
-
-    def way_back(self) -> Callable[[Impulses], Impulses]:
-        """Where those of the transposed system do."""
-        return functools.partial(self.nearly_back, self.inverse())
 
     def inverse(self) -> velocity_system.Inverse:
         """``G^-1``."""
@@ -178,7 +172,7 @@ class _Search(NamedTuple):
       x, residual: impulses and what they leave.
       last: way of the last step.
       unanswered: (world,) how often the impulses hold the way of what nothing answers to.
-      going: (world,) whether the residual is above round-off and still falls.
+      going: (world,) whether more steps are to be taken.
       count: () steps.
     """
 
@@ -229,9 +223,10 @@ def _solve(
         return _Search(_add(x, length, change), residual, last, unanswered + length * held, going, count + 1)
 
     zero = tuple(jnp.zeros_like(side) for side in right_sides)
-    none = jnp.zeros(like.shape[-1], like.dtype)
-    nowhere = _Way(zero, zero, none + jnp.inf, none)
-    start = _Search(zero, right_sides, nowhere, none, none == 0, jnp.zeros((), jnp.int32))
+    worlds = like.shape[-1]
+    never = jnp.zeros(worlds, like.dtype)
+    nowhere = _Way(zero, zero, jnp.full(worlds, jnp.inf, like.dtype), never)
+    start = _Search(zero, right_sides, nowhere, never, jnp.ones(worlds, bool), jnp.zeros((), jnp.int32))
     found = lax.while_loop(lambda search: (search.count < 3 * steps) & search.going.any(), step, start)
     return _add(found.x, -found.unanswered, way(found.residual))
 

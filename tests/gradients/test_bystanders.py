@@ -22,10 +22,7 @@ from tests.gradients.test_bounce_gradient import (
 from tests.gradients.test_collision_impulse import check_struck_rod
 from tests.gradients.test_slide_gradient import derivatives
 from tests.gradients.test_stick_slip import COUNT, THRESHOLD, push_with_slopes
-from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.scenes import DOWN, GRAVITY, undamped
-
-PRECISIONS = pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 
 
 def crowded(shape, gravity=DOWN, friction=0.5, restitution=0.0, dt=1 / 240, **body):
@@ -54,7 +51,6 @@ def test_one_bounce(precision, gate):
     check(gate, slopes, UNDER_GRAVITY, LIMIT[str(precision)])
 
 
-@PRECISIONS
 @pytest.mark.slow
 def test_several_bounces(precision, gate):
     """All in one program: steps of 1/240 s for the longest."""

@@ -13,7 +13,6 @@ import pytest
 from mathota_jax import Box, Compound, Fixed, Hinge, SceneBuilder, Sphere, contact_forces, rollout, step
 from mathota_jax.constraints import mechanism_layout
 from mathota_jax.state import Flag
-from tests.marks import QUICK_AND_SLOW_PRECISION
 from tests.physics.test_mechanism_contacts import LIGHT, carry_a_ball, derivatives_of_way, leg, on_ground, stand
 from tests.scenes import DOWN, GRAVITY, humanoid, quadruped, stiffened, undamped
 
@@ -109,7 +108,6 @@ def pincers(options):
     return builder.build(options)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.slow
 def test_pincers_press_with_the_torque_of_their_motors(precision, gate):
     """Torques of 3 and -3 N m press tips 0.4 m from their hinges with 7.5 N; neither moves."""
@@ -134,7 +132,6 @@ def stand_still(model, state, mass, moved, gate):
     assert not final.flags
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.slow
 @pytest.mark.parametrize("tiles", [0, 25])
 def test_a_robot_that_may_touch_itself_stands(precision, tiles, gate):

@@ -78,7 +78,6 @@ def test_changing_the_time_step_does_not_kick(precision, gate):
         gate(f"velocity after 1/60 -> {dt:.4f} [m/s]", record["velocity"], 1e-2)
 
 
-@pytest.mark.parametrize("precision", QUICK_AND_SLOW_PRECISION, indirect=True)
 @pytest.mark.slow
 def test_teleporting_out_and_back_does_not_kick(precision, gate):
     model, state = boxes()
