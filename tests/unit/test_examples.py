@@ -47,6 +47,7 @@ def test_there_is_an_example_for_each_reader():
         "batches",
         "robots",
         "pictures",
+        "scenes",
     }
 
 
