@@ -142,8 +142,12 @@ class Environment(abc.ABC):
         """The options of a reset as arrays.
 
         Raises:
-            ValueError: an option is unknown, is no array of numbers or has the wrong shape.
+            ValueError: the options have no names, or an option is unknown, is no array of numbers or has the wrong shape.
         """
+        if options is not None and not isinstance(options, Mapping):
+            raise ValueError(
+                f"{type(self).__name__}: reset options must be a dict of names and values, got {options!r}"
+            )
         checked = {}
         for name, value in (options or {}).items():
             if name not in self.reset_options:

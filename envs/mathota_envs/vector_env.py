@@ -109,8 +109,10 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             TypeError: the mask is not a NumPy array of bool.
             ResetNeeded: a mask was given before the first full reset.
         """
-        options = dict(options or {})
-        mask = self._checked_mask(options.pop("reset_mask", None))
+        mask = None
+        if isinstance(options, Mapping):
+            options = dict(options)
+            mask = self._checked_mask(options.pop("reset_mask", None))
         single_options = checked_reset_options(self.environment, options)
         world_options = repeated(single_options, self.num_envs)
         key = self._checked_keys(seed)

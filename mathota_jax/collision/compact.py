@@ -42,6 +42,23 @@ def compact_contacts(
       pair: (place, world) shapes A and B in the numbering of the broadphase, of the kinds of the group.
       active: (place, world) whether the place holds a pair.
     """
+    (a, pose_a), (b, pose_b) = shapes_of_places(scene, group, shapes, position, orientation, pair)
+    if "plane" not in (group.kind_a, group.kind_b):
+        pose_b = _off_centre(pair, pose_a, pose_b, bounding_radius(group.kind_a, a))
+    manifold = PAIRS[group.kind_a, group.kind_b].function(a, pose_a, b, pose_b)
+    found = flatten(manifold, active.shape[0])
+    return found._replace(active=found.active & jnp.repeat(active, group.point_count, axis=0))
+
+
+def shapes_of_places(
+    scene: Scene,
+    group: CompactGroup,
+    shapes: Shapes,
+    position: Vec3,
+    orientation: Quaternion,
+    pair: tuple[Array, Array],
+) -> tuple[tuple[dict[str, Any], Pose], tuple[dict[str, Any], Pose]]:
+    """Sizes and poses of shapes A and B of the pairs in the places of a group; arguments as for `compact_contacts`."""
     ranges = dict(kind_ranges(scene))
 
     def placed(kind: str, index: Array) -> tuple[dict[str, Any], Pose]:
@@ -51,12 +68,7 @@ def compact_contacts(
             return polyhedra_of_places(parameters, row), gather_together(pose, row)
         return gather_together((parameters, pose), row)
 
-    (a, pose_a), (b, pose_b) = placed(group.kind_a, pair[0]), placed(group.kind_b, pair[1])
-    if "plane" not in (group.kind_a, group.kind_b):
-        pose_b = _off_centre(pair, pose_a, pose_b, bounding_radius(group.kind_a, a))
-    manifold = PAIRS[group.kind_a, group.kind_b].function(a, pose_a, b, pose_b)
-    found = flatten(manifold, active.shape[0])
-    return found._replace(active=found.active & jnp.repeat(active, group.point_count, axis=0))
+    return placed(group.kind_a, pair[0]), placed(group.kind_b, pair[1])
 
 
 def _off_centre(pair: tuple[Array, Array], pose_a: Pose, pose_b: Pose, reach: Array) -> Pose:

@@ -10,23 +10,25 @@ import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.bodies import Bodies, of_all_bodies
 from mathota_jax.collision.bounds import admissible_pairs, swept_bounds
 from mathota_jax.collision.broadphase import PairList, candidate_pairs
-from mathota_jax.collision.compact import compact_contacts
+from mathota_jax.collision.compact import compact_contacts, shapes_of_places
 from mathota_jax.collision.narrowphase import ContactSet, stored
 from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
+from mathota_jax.constraints.flush import Ground, PlacedShape, decide, has_flat_neighbours, is_slanted, lies_flush
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours
 from mathota_jax.solver.rows import Places
 from mathota_jax.solver.table import TracedTable
 from mathota_jax.spatial.chunks import map_filled
-from mathota_jax.spatial.indexing import gather, take
+from mathota_jax.spatial.indexing import gather, gather_together, take
 from mathota_jax.spatial.running_sum import running_sum
 from mathota_jax.spatial.vector import Vec3, norm
 
@@ -95,42 +97,92 @@ def _turns_matter(scene: Scene, model: Model) -> bool:
 
 def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[ContactSet]:
     """Runs the narrow phase for the close pairs, a set for each compact group."""
-    scene = model.scene
-    assert scene.broadphase is not None
-    sets = []
-    for group, places in zip(scene.compact_groups, close.groups, strict=True):
-        contacts, pairs = _narrow_phase(model, group, bodies), (places.pair, places.active)
-        sets.append(map_filled(contacts, pairs, filled(places)) if scene.broadphase.one_by_one else contacts(pairs))
-    return sets
+    numbers = range(len(model.scene.compact_groups))
+    return [_contacts_of(model, bodies, close, number) for number in numbers]
+
+
+def contacts_with_static(model: Model, bodies: Bodies, close: ClosePairs) -> dict[int, ContactSet]:
+    """The same, by their numbers, of the groups of pairs of which one body alone moves, planes excepted."""
+    groups = enumerate(model.scene.compact_groups)
+    chosen = [k for k, group in groups if group.side_count == 1 and "plane" not in (group.kind_a, group.kind_b)]
+    return {number: _contacts_of(model, bodies, close, number) for number in chosen}
+
+
+def _contacts_of(model: Model, bodies: Bodies, close: ClosePairs, number: int) -> ContactSet:
+    group, places = model.scene.compact_groups[number], close.groups[number]
+    contacts, pairs = _narrow_phase(model, group, bodies), (places.pair, places.active)
+    assert model.scene.broadphase is not None
+    return map_filled(contacts, pairs, filled(places)) if model.scene.broadphase.one_by_one else contacts(pairs)
+
+
+def moving_side(scene: Scene, pair: tuple[Array, Array]) -> tuple[Array, Array]:
+    """(place, world) bodies that move of pairs of which one moves, and whether they are B."""
+    body_of, moves = jnp.asarray(admissible_pairs(scene).bodies, jnp.int32), jnp.asarray(_moving_shapes(scene))
+    b_moves = moves[pair[1]]
+    return jnp.where(b_moves, body_of[pair[1]], body_of[pair[0]]), b_moves
 
 
 def contacts_and_rows(
-    model: Model, bodies: Bodies, close: ClosePairs, motion: Motion
+    model: Model,
+    bodies: Bodies,
+    close: ClosePairs,
+    motion: Motion,
+    ground: Ground | None,
+    with_static: dict[int, ContactSet],
 ) -> tuple[list[ContactSet], list[ContactRows]]:
-    """`contacts_of`, and the rows of the contacts."""
+    """`contacts_of`, without those with shapes that are flush with the ground, and the rows of the contacts.
+
+    `with_static` are the contacts that were found for the ground.
+    """
     scene = model.scene
     assert scene.broadphase is not None
-    if scene.broadphase.one_by_one:
-        both = []
-        for group, places in zip(scene.compact_groups, close.groups, strict=True):
+    sets, rows = [], []
+    for number, (group, places) in enumerate(zip(scene.compact_groups, close.groups, strict=True)):
+        pairs, find = (places.pair, places.active), _narrow_phase(model, group, bodies)
+        if ground is not None and number in with_static and has_flat_neighbours(group.kind_a, group.kind_b):
+            found = jax.tree.map(lambda x, k=group.point_count: x.reshape(-1, k, x.shape[-1]), with_static[number])
+            pairs, find = (*pairs, found), _not_flush(model, group, bodies, ground)
+        if scene.broadphase.one_by_one:
             (table, placed), *_ = places.tables
-            found = _narrow_phase(model, group, bodies)
-            both.append(rows_one_by_one(scene, table, model, found, (places.pair, places.active), motion, placed))
-        sets, rows = zip(*both, strict=True)
-        return list(sets), list(rows)
-    sets, rows = contacts_of(model, bodies, close), []
-    for places, contacts in zip(close.groups, sets, strict=True):
+            contacts, found_rows = rows_one_by_one(scene, table, model, find, pairs, motion, placed)
+            sets.append(contacts)
+            rows.append(found_rows)
+            continue
+        sets.append(find(pairs))
         first = places.tables[0][0].first_slot
         for table, placed in places.tables:
             of_group = dataclasses.replace(table, first_slot=table.first_slot - first)
-            found = contact_rows(scene, of_group, model, stored(contacts, bodies.position.x), motion, placed)
-            rows.append(found._replace(rows=dataclasses.replace(found.rows, table=table)))
+            chosen = stored(sets[-1], bodies.position.x)
+            found_rows = contact_rows(scene, of_group, model, chosen, motion, placed)
+            rows.append(found_rows._replace(rows=dataclasses.replace(found_rows.rows, table=table)))
     return sets, rows
 
 
 def _narrow_phase(model: Model, group: CompactGroup, bodies: Bodies) -> Callable[[tuple], ContactSet]:
     def contacts(pairs: tuple) -> ContactSet:
         return compact_contacts(model.scene, group, model.shapes, bodies.position, bodies.orientation, *pairs)
+
+    return contacts
+
+
+def _not_flush(model: Model, group: CompactGroup, bodies: Bodies, ground: Ground) -> Callable[[tuple], ContactSet]:
+    """Of contacts (place, point, world) of pairs with static shapes those that are not flush with the ground."""
+    scene = model.scene
+    placement = lax.stop_gradient((model.shapes, bodies.position, bodies.orientation))
+
+    def contacts(pairs: tuple) -> ContactSet:
+        pair, _, found = pairs
+        found = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), found)
+        mover, b_moves = moving_side(scene, pair)
+        of_pair = gather_together(ground, mover)
+        sides = shapes_of_places(scene, group, *placement, pair)
+        placed = (PlacedShape(kind, *side) for kind, side in zip((group.kind_a, group.kind_b), sides, strict=True))
+        below, of_point = jax.tree.map(
+            lambda x: jnp.repeat(x, group.point_count, axis=0),
+            (lies_flush(of_pair, *placed, a_is_static=b_moves), of_pair),
+        )
+        slanted = is_slanted(of_point, lax.stop_gradient(found.normal))
+        return found._replace(active=found.active & ~decide(below & slanted, found.separation.dtype))
 
     return contacts
 

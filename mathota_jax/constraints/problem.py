@@ -28,6 +28,7 @@ from mathota_jax.constraints import (
 )
 from mathota_jax.constraints.contact_force import warm_start_impulse
 from mathota_jax.constraints.decoupling import Decoupling
+from mathota_jax.constraints.ground import find_ground, has_seams, without_flush
 from mathota_jax.constraints.slots import contact_offsets, matched_force, own_contacts
 from mathota_jax.constraints.swept import largest_turn, undisturbed, ways
 from mathota_jax.model import Model
@@ -148,6 +149,13 @@ def constrain(
     contacts, contact_rows, close, offsets = None, [], None, None
     if scene.slot_count:
         found = own_contacts(model, bodies)
+        if scene.broadphase is not None:
+            close = compact.close_pairs(model, bodies, free)
+        ground, with_static = None, {}
+        if has_seams(scene):
+            with_static = {} if close is None else compact.contacts_with_static(model, bodies, close)
+            ground = find_ground(model, bodies, found[0] if found else None, close, with_static)
+            found = [without_flush(model, bodies, ground, own) for own in found]
         if scene.options.continuous:
             found = [contact.near_contacts(scene, model, own) for own in found]
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
@@ -160,9 +168,8 @@ def constrain(
             contact_rows = [
                 contact.contact_rows(scene, table, model, own, motion) for table in contact.contact_tables(scene)
             ]
-        if scene.broadphase is not None:
-            close = compact.close_pairs(model, bodies, free)
-            sets, more = compact.contacts_and_rows(model, bodies, close, motion)
+        if close is not None:
+            sets, more = compact.contacts_and_rows(model, bodies, close, motion, ground, with_static)
             found, contact_rows = found + sets, contact_rows + more
         if held is not None and scene.rebounds_may_gain:
             contact_rows = rebound_limit.with_held_falling(held, contact_rows, gravity)

@@ -147,6 +147,8 @@ def test_bad_input_is_named():
         environment.step(np.zeros(2))
     with pytest.raises(ValueError, match="actions must be numbers"):
         environment.step("left")
+    with pytest.raises(ValueError, match="reset options must be a dict of names and values, got 3"):
+        environment.reset(options=3)
     with pytest.raises(ValueError, match="unknown reset option 'numbr'; valid options: number"):
         environment.reset(options={"numbr": 1.0})
     with pytest.raises(ValueError, match="reset option 'number' must be finite"):

@@ -242,6 +242,8 @@ def test_bad_input_is_named():
         environment.step(np.zeros(4))
     with pytest.raises(ValueError, match="one seed for each of the 4 worlds, got 3"):
         environment.reset(seed=[1, 2, 3])
+    with pytest.raises(ValueError, match="reset options must be a dict of names and values, got 3"):
+        environment.reset(options=3)
     with pytest.raises(ValueError, match="unknown reset option 'numbr'"):
         environment.reset(options={"numbr": 0.0})
     for mask, error, text in (
