@@ -148,7 +148,8 @@ def solve_rows(
         return SolvedRows(solved, impulses, held=held)
     if scene.rebounds_may_gain:
         start = in_every_world(start, worlds)
-    begin = _Begin(velocity, _held(scene, problem, velocity, start), start, change, inertia)
+    with_joints = velocity if problem.with_joints is None else problem.with_joints
+    begin = _Begin(velocity, with_joints, start, change, inertia)
     solved, impulses, failed = _solve_all(scene, problem, begin, known)
     if not scene.rebounds_may_gain:
         return SolvedRows(solved, impulses, failed)
@@ -165,7 +166,7 @@ class _Begin(NamedTuple):
 
     Attributes:
       velocity: (component, block, world) without constraints.
-      with_joints: the same where mechanisms hold, if anything asks for it.
+      with_joints: the same where mechanisms hold.
       impulses: of all groups.
       change: what these do to the velocity, where that is known.
       inertia: with which the bodies respond.
@@ -176,13 +177,6 @@ class _Begin(NamedTuple):
     impulses: tuple[Array, ...]
     change: Array | None
     inertia: Inertia
-
-
-def _held(scene: Scene, problem: Problem, velocity: Array, start: tuple[Array, ...]) -> Array:
-    """Velocity with which mechanisms hold, and nothing else, where contacts act on them as wholes or their work counts."""
-    if problem.held is None or (problem.reduced is None and not scene.rebounds_may_gain):
-        return velocity
-    return mechanism.hold(problem.held, problem.joint_rows, velocity, start)[0]
 
 
 def _solve_all(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from mathota_jax import Hinge, Slider, State
@@ -43,7 +44,18 @@ def place(rest_state: State, joints: Sequence[Hinge | Slider], position: Array, 
 
     Returns:
         The state with the jointed bodies placed; joint coordinates and rates are exactly those given.
+
+    Raises:
+        ValueError: a joint is of another kind, or names a body where its handle is needed.
     """
+    for number, joint in enumerate(joints):
+        if not isinstance(joint, Hinge | Slider):
+            raise ValueError(f"place: joints[{number}] must be a Hinge or a Slider, got {joint!r}")
+        if isinstance(joint.parent, str) or isinstance(joint.child, str):
+            raise ValueError(
+                f"place: joints[{number}] names its bodies, {joint.parent!r} and {joint.child!r}; declare it with their "
+                "handles, as add_body returned them"
+            )
     zero = jnp.zeros_like(position[0])
     origin = Vec3(zero, zero, zero)
     fixed = _Motion(Quaternion(zero + 1, zero, zero, zero), origin, origin, origin)
@@ -58,7 +70,8 @@ def place(rest_state: State, joints: Sequence[Hinge | Slider], position: Array, 
 
 
 def _moved(parent: _Motion, joint: Hinge | Slider, position: Array, velocity: Array) -> _Motion:
-    axis, anchor = Vec3(*map(float, joint.axis)), Vec3(*map(float, joint.anchor))
+    direction = np.asarray(joint.axis, float)
+    axis, anchor = Vec3(*map(float, direction / np.linalg.norm(direction))), Vec3(*map(float, joint.anchor))
     axis_w = to_matrix(parent.rotation).apply(axis)
     if isinstance(joint, Slider):
         return parent._replace(

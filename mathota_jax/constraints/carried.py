@@ -38,7 +38,7 @@ def resting(contacts: Sequence[ContactRows], last: Sequence[Array], fall: Array,
         assert contact.load is not None
         # The impulse holds all through the step.
         lever = jnp.where(rests, 0.5 * dt, contact.lever)
-        load = Load(jnp.where(rests, 0.0, contact.load.asked), jnp.where(rests, 0.5 * dt, contact.load.lever))
+        load = Load(jnp.where(rests, 0.0, contact.load.alone), jnp.where(rests, 0.5 * dt, contact.load.lever))
         rows = with_first_bias(contact.rows, jnp.where(rests, 0.0, bias))
         found.append(contact._replace(rows=rows, lever=lever, load=load))
     return found

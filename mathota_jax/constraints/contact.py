@@ -61,6 +61,7 @@ class Motion(NamedTuple):
       velocity, free_velocity: (component, block, world) now, and at the end of the step if nothing constrained them.
       inertia: inverse, in the world frame.
       gravity: [m/s^2].
+      mass_together: (block, world) of the mechanism of each body, of a body of none its own; None without mechanisms.
     """
 
     position: Vec3
@@ -68,17 +69,18 @@ class Motion(NamedTuple):
     free_velocity: Array
     inertia: InverseInertia
     gravity: Vec3
+    mass_together: Array | None = None
 
 
 class Load(NamedTuple):
     """Rebounds of contacts that may carry others, (turn, 1, column, world).
 
     Attributes:
-      asked: change of the normal velocity that the rebound asks for; 0 for no rebound.
+      alone: impulse that the rebound takes if nothing else is carried; 0 for no rebound.
       lever: time [s] that the impulse has to act if most of it carries others.
     """
 
-    asked: Array
+    alone: Array
     lever: Array
 
 
@@ -232,8 +234,8 @@ def contact_rows(
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     falling, load = None, None
     if scene.restitution and scene.options.solver != "soft_step":
-        asked, lasting = loaded(approach, target, lever, model.dt)
-        load = Load(*(pack_scalars(table, [part], worlds) for part in (asked, lasting)))
+        asked, lasting = (pack_scalars(table, [x], worlds) for x in loaded(approach, target, lever, model.dt))
+        load = Load(asked * _rebounding_mass(table, rows, motion, worlds), lasting)
     if scene.rebounds_may_gain:
         side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
         falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
@@ -251,6 +253,16 @@ def contact_rows(
         load=load,
         ahead=ahead,
     )
+
+
+def _rebounding_mass(table: Table | TracedTable, rows: Rows, motion: Motion, worlds: int) -> Array:
+    """(turn, 1, column, world) mass that rebounds at each contact, that of whole mechanisms."""
+    if motion.mass_together is None:
+        return normal_mass(rows)
+    sides = rows.places.blocks if rows.places is not None else table.blocks  # type: ignore[union-attr]
+    lightness = [1.0 / select_blocks(table, side, motion.mass_together, rows.places) for side in range(len(sides))]
+    together = pack_scalars(table, [1.0 / functools.reduce(jnp.add, lightness)], worlds)
+    return jnp.where(normal_mass(rows) > 0, jnp.maximum(normal_mass(rows), together), 0.0)
 
 
 def _rates(table: Table | TracedTable, matrix: Any, places: Places | None, velocity: Array, like: ContactSet) -> Array:

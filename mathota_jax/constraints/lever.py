@@ -7,13 +7,18 @@ import functools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-from mathota_jax.constraints.contact import ContactRows, normal_mass
+from mathota_jax.bodies import Inertia, momentum
+from mathota_jax.constraints import mechanism
+from mathota_jax.constraints.contact import ContactRows
+from mathota_jax.constraints.mechanism_layout import Layout
+from mathota_jax.constraints.mechanism_links import Links
 from mathota_jax.scene import Scene
 from mathota_jax.solver.row_matrix import Dense, RowMatrix, sum_over_points
-from mathota_jax.solver.rows import Rows, add_changes
-from mathota_jax.spatial.indexing import unstack
+from mathota_jax.solver.rows import Rows, add_changes, add_impulses
+from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
@@ -44,7 +49,8 @@ def levers(
     impulses: Sequence[Array],
     free: Array,
     solved: Array,
-) -> tuple[Array, Vec3 | None]:
+    held_by: tuple[Links, Inertia] | None = None,
+) -> tuple[Array, Array | None]:
     """Time that the velocity change by the constraints had to act on the position of each body.
 
     A joint holds for the whole step (on average dt/2), a contact as long as it lasts. A body takes the mean of its rows,
@@ -52,15 +58,19 @@ def levers(
     with its own lever, as far as the impulses do not cancel: a ball that flies into a corner leaves each wall at its own
     time, but the large opposite impulses on a light body below a heavy one do not throw it out. Rotation keeps to the mean.
 
+    What a contact does to a mechanism, through its joints, too, lasts as long as the contact: a foot would else stop when it
+    meets the ground, and what it carries at half of the step. All of a mechanism takes the mean of its contacts.
+
     Args:
       scene: static scene.
       dt: time step.
       joint_rows, contact_rows: all groups.
       impulses: solved, those of the joints first, for each group (turn, row, column, world).
       free, solved: (component, block, world) velocities without and with them.
+      held_by: mechanisms, and the inertia of all moving bodies; None where there are none.
 
     Returns:
-      The mean lever (block, world), and the displacement beyond it; None where no body touches several others.
+      The mean lever (block, world), and the displacement (component, block, world) beyond it; None where nothing is.
     """
     half = 0.5 * dt
     if not contact_rows:
@@ -77,6 +87,7 @@ def levers(
         if several:
             parts = [_with_movement(part, side, size, 0.0) for part, side in zip(parts, group.response, strict=True)]
         total = add_changes(group, Dense((), tuple(parts)), total, size)
+    of_joints = total[:2]
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
         if several:
             # Relative to half the step, contacts at rest add nothing at all.
@@ -88,14 +99,44 @@ def levers(
             parts = (share,) * len(group.rows.jacobian)
             total = add_changes(group.rows, Dense((), parts), total, impulse[:, :1])
     mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
-    return mean, _beyond(total[2:], mean - half, solved - free) if several else None
+    beyond = None
+    if several:
+        moved = _beyond(total[2:], mean - half, solved - free)
+        beyond = jnp.concatenate([jnp.stack(moved), jnp.zeros_like(solved[3:])])
+    if held_by is None:
+        return mean, beyond
+    links, inertia = held_by
+    found = links.layout
+    lever = _of_mechanisms(found, total[:2] - of_joints, half)
+    rows = tuple(group.rows for group in contact_rows)
+    change = add_impulses(rows, jnp.zeros_like(solved), tuple(impulses[count:]))
+    more = mechanism.respond(links, momentum(inertia, change)) * (lever - half)
+    beyond = jnp.where(found.is_link[:, None], more, 0.0 if beyond is None else beyond)
+    return jnp.where(found.is_link[:, None], half, mean), beyond
+
+
+def _of_mechanisms(found: Layout, total: Array, half: Array) -> Array:
+    """(block, world) mean lever of the contacts of the mechanism of each body, of any other body anything.
+
+    `total` (2, block, world) are the sums of weights, and of weights times levers, of the contacts of each body.
+    """
+    tree_of = np.zeros(found.block_count, int)
+    levers = []
+    for number, links in enumerate(found.trees):
+        blocks = [found.blocks[link] for link in links]
+        tree_of[blocks] = number
+        weight, moment = unstack(
+            jnp.broadcast_to(take(total, blocks, axis=1), (2, len(blocks), total.shape[-1])).sum(1), 0
+        )
+        levers.append(jnp.where(weight > 0, safe_divide(moment, weight), half))
+    return take(jnp.stack(jnp.broadcast_arrays(*levers)), tree_of)
 
 
 def _under_load(group: ContactRows, impulse: Array) -> ContactRows:
     """The contacts with the levers that rebounds have where they carry others."""
     if group.load is None:
         return group
-    alone, found = LOADED * normal_mass(group.rows) * group.load.asked, impulse[:, :1]
+    alone, found = LOADED * group.load.alone, impulse[:, :1]
     share = jnp.where((alone > 0) & (found > alone), safe_divide(alone, found), 1.0)
     # Which of the two it is has no derivative.
     share = store(lax.stop_gradient(share), found)

@@ -137,7 +137,7 @@ def layout(scene: Scene) -> Layout | None:
     if options.impact_events or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
-    if found is None or options.solver == "soft_step" or _has_no_others(scene, found):
+    if found is None or options.solver in ("soft_step", "converged") or _has_no_others(scene, found):
         return found
     if _contact_places(scene, found) is not None or _has_stiff_drives(scene, found):
         return found

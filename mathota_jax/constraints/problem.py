@@ -17,6 +17,7 @@ from mathota_jax.constraints import (
     joint,
     joint_layout,
     joint_rows,
+    mechanism,
     mechanism_contacts,
     mechanism_layout,
     mechanism_links,
@@ -55,7 +56,8 @@ class Problem(NamedTuple):
 
     `held` are the mechanisms at the middle of the step, `responses` theirs to their rows with bounds; `errors` are those of
     all groups, for the small steps alone; `decouplings` are those of the joint rows, none where these are as they were;
-    `offsets` are where contacts are matched by distance.
+    `offsets` are where contacts are matched by distance; `with_joints` are velocities (component, block, world) at the end
+    of the step if mechanisms hold and nothing else does, where there are contacts beside them.
     """
 
     joints: joint_rows.JointRows | None
@@ -69,6 +71,7 @@ class Problem(NamedTuple):
     decouplings: tuple[Decoupling, ...] = ()
     offsets: Vec3 | None = None
     reduced: mechanism_contacts.Reduced | None = None
+    with_joints: Array | None = None
 
     @property
     def overflow(self) -> Array | None:
@@ -146,7 +149,7 @@ def constrain(
                 substep_rows.joint_error(scene, rows, model, joint_motion, how)
                 for rows, how in zip(tables, decouplings, strict=True)
             )
-    contacts, contact_rows, close, offsets = None, [], None, None
+    contacts, contact_rows, close, offsets, with_joints = None, [], None, None, None
     if scene.slot_count:
         found = own_contacts(model, bodies)
         if scene.broadphase is not None:
@@ -160,8 +163,14 @@ def constrain(
             found = [contact.near_contacts(scene, model, own) for own in found]
         now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
         then = contact.pack_motion(scene, *free)
+        if held is not None:
+            # What presses a contact is what is left when the joints hold: a force beside a joint would turn its body.
+            then = with_joints = mechanism.hold(
+                held, tables, then, tuple(jnp.zeros_like(rows.bias) for rows in tables)
+            )[0]
         inverse = compute_once(inertia.inverse(), state.position)
-        motion = contact.Motion(blocks.position, now, then, inverse, gravity)
+        together = None if held is None else mechanism.mass_together(held.layout, inertia)
+        motion = contact.Motion(blocks.position, now, then, inverse, gravity, together)
         if scene.pair_groups:
             way, turn = ways(scene, bodies, now, then, model.dt), largest_turn(scene, bodies, free[1], model.dt)
             own = found[0]._replace(apart=undisturbed(model, way, turn, found[0]))
@@ -181,7 +190,18 @@ def constrain(
     if held is not None and mechanism_layout.takes_contacts(scene):
         reduced = mechanism_contacts.reduce(scene, held, inertia, tables, contact_rows)
     return Problem(
-        joints, held, responses, tables, contacts, contact_rows, close, errors, decouplings, offsets, reduced
+        joints,
+        held,
+        responses,
+        tables,
+        contacts,
+        contact_rows,
+        close,
+        errors,
+        decouplings,
+        offsets,
+        reduced,
+        with_joints,
     )
 
 

@@ -28,7 +28,7 @@ def advance(
     solved: Array,
     lever: Array | None,
     dt: Array,
-    beyond: Vec3 | None = None,
+    beyond: Array | None = None,
     gained: Array | None = None,
 ) -> tuple[Bodies, tuple[Vec3, Vec3]]:
     """Moves the bodies through one step (guide 11.1, phase 6).
@@ -46,7 +46,7 @@ def advance(
       solved: (component, block, world) velocities with all constraint impulses.
       lever: (block, world) time [s] that the velocity change by the constraints had to act on the position.
       dt: time step.
-      beyond: what they move the bodies more than that.
+      beyond: (component, block, world) what they move the bodies more than that, as `gained`.
       gained: (component, block, world) displacement by the constraints where it is known itself, in place of the lever.
 
     Returns:
@@ -55,11 +55,12 @@ def advance(
     free_linear, free_angular = free
     solved_linear, solved_angular = unpack_blocks(solved)
     gained_linear, gained_angular = (None, None) if gained is None else unpack_blocks(gained)
+    beyond_linear, beyond_angular = (None, None) if beyond is None else unpack_blocks(beyond)
     if gained_linear is None:
         assert lever is not None
         gained_linear = (solved_linear - free_linear) * lever
-        if beyond is not None:
-            gained_linear = gained_linear + beyond
+        if beyond_linear is not None:
+            gained_linear = gained_linear + beyond_linear
     shift = (bodies.velocity + free_linear) * (0.5 * dt) + gained_linear
     start = inertia.apply(bodies.angular_velocity)
     end = (start + torque * dt) * decay
@@ -72,6 +73,8 @@ def advance(
         else:
             assert lever is not None
             mean = mean + change * (lever / dt)
+            if beyond_angular is not None:
+                mean = mean + acting.apply(beyond_angular) / dt
     mean, end, shift = compute_once((mean, end, shift), bodies.position.x)
     if halfway is None:
         orientation, turn = rotate_at_constant_momentum(bodies.orientation, inertia, mean, dt)

@@ -9,7 +9,7 @@ from mathota_envs import ENVIRONMENTS, make
 from mathota_envs.ball_balance import TILT_X, TILT_Z
 from mathota_envs.inverted_pendulum import HINGE, SLIDER
 from mathota_envs.kinematics import place
-from mathota_jax import joint_position, joint_velocity
+from mathota_jax import Box, Fixed, Hinge, SceneBuilder, joint_position, joint_velocity
 
 TREES = {"mathota/InvertedPendulum-v0": (SLIDER, HINGE), "mathota/BallBalance-v0": (TILT_X, TILT_Z)}
 
@@ -55,3 +55,19 @@ def test_velocities_are_the_derivatives_of_poses(id, float64):
 
 def test_every_environment_is_covered():
     assert set(TREES) <= set(ENVIRONMENTS)
+
+
+def test_axes_of_any_length_and_bad_joints(float64):
+    builder = SceneBuilder()
+    base = builder.add_body(Box((0.1, 0.1, 0.1)), static=True, collides=False, name="base")
+    arm = builder.add_body(Box((0.1, 0.3, 0.1)), mass=1.0, position=(0, -0.3, 0), collides=False)
+    joint = Hinge(base, arm, anchor=(0, 0, 0), axis=(0, 0, 5.0))
+    builder.add_joint(joint)
+    model, state = builder.build()
+    placed = place(state, [joint], jnp.array([0.4]), jnp.array([2.0]))
+    np.testing.assert_allclose(joint_position(model, placed), [0.4], atol=1e-12)
+    np.testing.assert_allclose(joint_velocity(model, placed), [2.0], atol=1e-12)
+    with pytest.raises(ValueError, match=r"place: joints\[0\] names its bodies, 'base' and 1"):
+        place(state, [Hinge("base", arm, anchor=(0, 0, 0), axis=(0, 0, 1))], jnp.zeros(1), jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"place: joints\[0\] must be a Hinge or a Slider"):
+        place(state, [Fixed(base, arm)], jnp.zeros(1), jnp.zeros(1))  # type: ignore[list-item]
