@@ -201,9 +201,8 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
         solved, impulses, failed, held, uncut = solve_rows(
             scene, problem, acting, packed, start, change, is_solved, held
         )
-        held_by = None if problem.held is None else (problem.held, acting)
         lever, beyond = levers(
-            scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved, held_by
+            scene, model.dt, problem.joint_rows, problem.contact_rows, impulses, packed, solved, problem.with_joints
         )
     moved, displacement = advance(
         blocks, inertia, acting, halfway, free, torque, decay, solved, lever, model.dt, beyond, gained

@@ -28,7 +28,7 @@ from mathota_jax.constraints.joint_rows import JointRows, joint_rows
 from mathota_jax.constraints.problem import Problem
 from mathota_jax.constraints.rebound_limit import share_without_gain
 from mathota_jax.constraints.row_coefficients import row_coefficients
-from mathota_jax.constraints.swept import misses, ways
+from mathota_jax.constraints.swept import Way, largest_turn, may_strike, misses, ways
 from mathota_jax.model import Model
 from mathota_jax.scene import Scene
 from mathota_jax.solver import converged, pgs
@@ -94,7 +94,9 @@ def foreseen(
     exact = (model, problem.contact_rows, now, then, left)
     fixed = lax.stop_gradient((model, problem.contact_rows, bodies, now, then, pull, left))
     model, groups, bodies, now, then, pull, left = fixed
-    past = misses(model, ways(model.scene, bodies, now, then, left))
+    way = ways(model.scene, bodies, now, then, left)
+    past = misses(model, way)
+    bounces = bounces | _turn_into_each_other(model, bodies, way, then, left, problem.contacts)
     for group, exact_group in zip(groups, exact[1], strict=True):
         rows = group.rows
         if isinstance(rows.table, TracedTable):
@@ -122,6 +124,19 @@ def foreseen(
         found.append(Foreseen(meets | followed, clear, *_leave(exact[0], exact_group, *exact[2:], fast)))
         bounces = bounces | (meets & (e > 0)).any((0, 1, 2))
     return tuple(found), bounces
+
+
+def _turn_into_each_other(
+    model: Model, bodies: Bodies, way: Way, then: Array, left: Array, contacts: ContactSet | None
+) -> Array:
+    """(world,) whether any that bounce may meet where they have no contact yet, since they turn; arguments as above."""
+    _, spins = unpack_blocks(then)
+    if spins is None or contacts is None:
+        return jnp.zeros(then.shape[-1], bool)
+    pairs = [(a, b) for group in model.scene.pair_groups for a, b in zip(group.bodies_a, group.bodies_b, strict=True)]
+    bounce = jnp.minimum(*(take(model.restitution, side) for side in zip(*pairs, strict=True))) > 0
+    turn = largest_turn(model.scene, bodies, spins, left)
+    return (bounce & may_strike(model, way, turn, contacts)).any(0)
 
 
 def _leave(

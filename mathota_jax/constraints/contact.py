@@ -256,13 +256,17 @@ def contact_rows(
 
 
 def _rebounding_mass(table: Table | TracedTable, rows: Rows, motion: Motion, worlds: int) -> Array:
-    """(turn, 1, column, world) mass that rebounds at each contact, that of whole mechanisms."""
+    """(turn, 1, column, world) mass that rebounds at each contact, where links rebound with their whole mechanisms."""
+    mass = normal_mass(rows)
     if motion.mass_together is None:
-        return normal_mass(rows)
-    sides = rows.places.blocks if rows.places is not None else table.blocks  # type: ignore[union-attr]
-    lightness = [1.0 / select_blocks(table, side, motion.mass_together, rows.places) for side in range(len(sides))]
-    together = pack_scalars(table, [1.0 / functools.reduce(jnp.add, lightness)], worlds)
-    return jnp.where(normal_mass(rows) > 0, jnp.maximum(normal_mass(rows), together), 0.0)
+        return mass
+    sides = range(len(rows.places.blocks if rows.places is not None else table.blocks))  # type: ignore[union-attr]
+
+    def of_pairs(lightness: Array) -> Array:
+        return functools.reduce(jnp.add, [select_blocks(table, side, lightness, rows.places) for side in sides])
+
+    share = of_pairs(motion.inertia.inverse_mass) / of_pairs(1.0 / motion.mass_together)
+    return mass * pack_scalars(table, [share], worlds)
 
 
 def _rates(table: Table | TracedTable, matrix: Any, places: Places | None, velocity: Array, like: ContactSet) -> Array:

@@ -10,14 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.bodies import Inertia, momentum
-from mathota_jax.constraints import mechanism
 from mathota_jax.constraints.contact import ContactRows
-from mathota_jax.constraints.mechanism_layout import Layout
-from mathota_jax.constraints.mechanism_links import Links
+from mathota_jax.constraints.mechanism_layout import Layout, layout
 from mathota_jax.scene import Scene
 from mathota_jax.solver.row_matrix import Dense, RowMatrix, sum_over_points
-from mathota_jax.solver.rows import Rows, add_changes, add_impulses
+from mathota_jax.solver.rows import Rows, add_changes
 from mathota_jax.spatial.indexing import take, unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, store
@@ -49,7 +46,7 @@ def levers(
     impulses: Sequence[Array],
     free: Array,
     solved: Array,
-    held_by: tuple[Links, Inertia] | None = None,
+    with_joints: Array | None = None,
 ) -> tuple[Array, Array | None]:
     """Time that the velocity change by the constraints had to act on the position of each body.
 
@@ -58,8 +55,8 @@ def levers(
     with its own lever, as far as the impulses do not cancel: a ball that flies into a corner leaves each wall at its own
     time, but the large opposite impulses on a light body below a heavy one do not throw it out. Rotation keeps to the mean.
 
-    What a contact does to a mechanism, through its joints, too, lasts as long as the contact: a foot would else stop when it
-    meets the ground, and what it carries at half of the step. All of a mechanism takes the mean of its contacts.
+    What contacts change of a mechanism, with what stops and motors do about it, lasts as long as the contacts: a foot would
+    else stop when it meets the ground, and what it carries at half of the step. All of it takes the mean of its contacts.
 
     Args:
       scene: static scene.
@@ -67,7 +64,7 @@ def levers(
       joint_rows, contact_rows: all groups.
       impulses: solved, those of the joints first, for each group (turn, row, column, world).
       free, solved: (component, block, world) velocities without and with them.
-      held_by: mechanisms, and the inertia of all moving bodies; None where there are none.
+      with_joints: velocities where mechanisms hold and nothing else does; None without mechanisms.
 
     Returns:
       The mean lever (block, world), and the displacement (component, block, world) beyond it; None where nothing is.
@@ -103,14 +100,11 @@ def levers(
     if several:
         moved = _beyond(total[2:], mean - half, solved - free)
         beyond = jnp.concatenate([jnp.stack(moved), jnp.zeros_like(solved[3:])])
-    if held_by is None:
+    if with_joints is None:
         return mean, beyond
-    links, inertia = held_by
-    found = links.layout
-    lever = _of_mechanisms(found, total[:2] - of_joints, half)
-    rows = tuple(group.rows for group in contact_rows)
-    change = add_impulses(rows, jnp.zeros_like(solved), tuple(impulses[count:]))
-    more = mechanism.respond(links, momentum(inertia, change)) * (lever - half)
+    found = layout(scene)
+    assert found is not None
+    more = (solved - with_joints) * (_of_mechanisms(found, total[:2] - of_joints, half) - half)
     beyond = jnp.where(found.is_link[:, None], more, 0.0 if beyond is None else beyond)
     return jnp.where(found.is_link[:, None], half, mean), beyond
 

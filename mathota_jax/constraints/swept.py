@@ -27,6 +27,10 @@ DEFLECTION = 3.0
 far heavier, and what friction adds."""
 
 
+LEAST_TURN = 0.01
+"""Angle [rad] in a step up to which bodies meet where their contacts are: others come closer by no more of their size."""
+
+
 class Way(NamedTuple):
     """What bodies may do in some time if nothing stops them; components (body, world) [m].
 
@@ -96,6 +100,20 @@ def undisturbed(model: Model, way: Way, turn: Array, contacts: ContactSet) -> Ar
     deflection = DEFLECTION * _sum_by_body(scene, jnp.concatenate(strikes))
     apart = _by_slot(scene, [_stays_apart(model, group, way, deflection) for group in scene.pair_groups])
     return apart & np.asarray([[scene.jointed.isdisjoint(pair)] for pair in zip(*scene.slot_bodies, strict=True)])
+
+
+def may_strike(model: Model, way: Way, turn: Array, contacts: ContactSet) -> Array:
+    """(pair, world) which pairs may meet elsewhere than at their contacts, since they turn; arguments as above."""
+    turn, found, first = lax.stop_gradient(turn), [], 0
+    for group in model.scene.pair_groups:
+        slots = range(first, first + group.slot_count)
+        first = slots.stop
+        of_group = take(lax.stop_gradient(contacts)._replace(converged=None, apart=None), slots)
+        turns = take(turn, group.bodies_a) + take(turn, group.bodies_b) > LEAST_TURN
+        round_ones = {group.kind_a, group.kind_b} <= {"plane", "sphere"}
+        strikes = _strikes(model, group, way, turn, of_group) > 0
+        found.append(jnp.zeros_like(strikes) if round_ones else strikes & turns)
+    return jnp.concatenate(found)
 
 
 def _strikes(model: Model, group: PairGroup, way: Way, turn: Array, contacts: ContactSet) -> Array:

@@ -32,6 +32,9 @@ from mathota_jax.spatial.vector import Vec3, cross, dot, norm
 ADVANCES = 64
 """Largest number of steps of the search."""
 
+LOOK = 0.05
+"""Angle [rad] after which bodies that touch and turn are looked at again."""
+
 MARGIN = 256
 """Multiples of the machine epsilon, of the time that is left, before its end from which an impact waits for the next step:
 something must be left to divide by."""
@@ -114,6 +117,7 @@ def _search(
     rebound = jnp.where(restitution > 0, restitution, 1.0)
     acceleration = b.acceleration - a.acceleration
     shape = (count, wanted.shape[-1])
+    turns = not {group.kind_a, group.kind_b} <= {"plane", "sphere"}
     end = jnp.broadcast_to(end, shape)
 
     def look(time: Array, level: Array, first: Array) -> tuple[Array, ...]:
@@ -149,6 +153,10 @@ def _search(
             deepest, rate_there = jnp.where(deeper, gap, deepest), jnp.where(deeper, rate, rate_there)
             bend_there = jnp.where(deeper, bend, bend_there)
             impact = impact | (counts & (gap <= near) & (rate < 0))
+        if turns:
+            # Other corners may come, too: not before the gap is gone, and those that came are found by going back.
+            safe = jnp.maximum(safe_divide(deepest, scale), safe_divide(LOOK, spin_a + spin_b))
+            step = jnp.where(spin_a + spin_b > 0, jnp.minimum(step, safe), step)
         return level, step, deepest, rate_there, bend_there, impact
 
     def advance(state: _Search) -> _Search:
