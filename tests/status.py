@@ -72,6 +72,12 @@ FEATURES = (
         "mathota_jax.constraints:mechanism_contacts",
         "physics/test_mechanism_contacts.py",
     ),
+    Feature("jointed bodies that land and rebound as one", "mathota_jax.constraints:lever", "physics/test_landing.py"),
+    Feature(
+        "floors of several shapes, without bumps at their seams",
+        "mathota_jax.constraints:flush",
+        "physics/test_seams.py",
+    ),
     Feature(
         "springs and servos of any stiffness",
         "mathota_jax.constraints:mechanism_drives",

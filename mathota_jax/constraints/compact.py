@@ -21,7 +21,7 @@ from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.compact import compact_contacts, shapes_of_places
 from mathota_jax.collision.narrowphase import ContactSet, stored
 from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
-from mathota_jax.constraints.flush import Ground, PlacedShape, decide, has_flat_neighbours, is_slanted, lies_flush
+from mathota_jax.constraints.flush import Ground, PlacedShape, decide, may_be_flush, is_slanted, lies_flush
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours
@@ -101,11 +101,15 @@ def contacts_of(model: Model, bodies: Bodies, close: ClosePairs) -> list[Contact
     return [_contacts_of(model, bodies, close, number) for number in numbers]
 
 
+def groups_with_static(scene: Scene) -> list[int]:
+    """Numbers of the groups of pairs of which one body alone moves, planes excepted."""
+    groups = enumerate(scene.compact_groups)
+    return [k for k, group in groups if group.side_count == 1 and "plane" not in (group.kind_a, group.kind_b)]
+
+
 def contacts_with_static(model: Model, bodies: Bodies, close: ClosePairs) -> dict[int, ContactSet]:
-    """The same, by their numbers, of the groups of pairs of which one body alone moves, planes excepted."""
-    groups = enumerate(model.scene.compact_groups)
-    chosen = [k for k, group in groups if group.side_count == 1 and "plane" not in (group.kind_a, group.kind_b)]
-    return {number: _contacts_of(model, bodies, close, number) for number in chosen}
+    """`contacts_of` for `groups_with_static`, by their numbers."""
+    return {number: _contacts_of(model, bodies, close, number) for number in groups_with_static(model.scene)}
 
 
 def _contacts_of(model: Model, bodies: Bodies, close: ClosePairs, number: int) -> ContactSet:
@@ -139,7 +143,7 @@ def contacts_and_rows(
     sets, rows = [], []
     for number, (group, places) in enumerate(zip(scene.compact_groups, close.groups, strict=True)):
         pairs, find = (places.pair, places.active), _narrow_phase(model, group, bodies)
-        if ground is not None and number in with_static and has_flat_neighbours(group.kind_a, group.kind_b):
+        if ground is not None and number in with_static and may_be_flush(group.kind_a, group.kind_b):
             found = jax.tree.map(lambda x, k=group.point_count: x.reshape(-1, k, x.shape[-1]), with_static[number])
             pairs, find = (*pairs, found), _not_flush(model, group, bodies, ground)
         if scene.broadphase.one_by_one:

@@ -59,8 +59,8 @@ class PlacedShape(NamedTuple):
     pose: Pose
 
 
-def has_flat_neighbours(kind_a: str, kind_b: str) -> bool:
-    """Whether shapes of these kinds, one of them static, may lie flush with others."""
+def may_be_flush(kind_a: str, kind_b: str) -> bool:
+    """Whether the static one of two shapes of these kinds may lie flush with others: it ends on all sides."""
     return {kind_a, kind_b} <= set(SUPPORT)
 
 

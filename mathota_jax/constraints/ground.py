@@ -19,7 +19,7 @@ from mathota_jax.constraints.flush import (
     Ground,
     PlacedShape,
     decide,
-    has_flat_neighbours,
+    may_be_flush,
     is_slanted,
     lies_flush,
 )
@@ -48,7 +48,7 @@ class Touch(NamedTuple):
 def has_seams(scene: Scene) -> bool:
     """Whether bodies may rest on one static shape and meet another one, which may be flush with it."""
     shapes = _own_grounds(scene)
-    if scene.broadphase is not None and any(group.side_count == 1 for group in scene.compact_groups):
+    if scene.broadphase is not None and compact.groups_with_static(scene):
         taking_part = [scene.shapes[place] for place in scene.broadphase.shapes]
         shapes |= {(shape.kind, shape.index) for shape in taking_part if scene.static[shape.body]}
     # Planes end nowhere, and nothing is flush with a heightfield but what is not one.
@@ -105,7 +105,7 @@ def without_flush(model: Model, bodies: Bodies, ground: Ground, contacts: Contac
         slots = range(first, first + group.slot_count)
         first = slots.stop
         moves = _moving_side(scene, group)
-        if not has_flat_neighbours(group.kind_a, group.kind_b) or not moves.any():
+        if not may_be_flush(group.kind_a, group.kind_b) or not moves.any():
             flush.append(jnp.zeros((len(slots), worlds), bool))
             continue
         mover = np.where(moves < 0, group.bodies_a, group.bodies_b)
