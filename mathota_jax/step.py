@@ -180,7 +180,7 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     acting, halfway = acting_inertia(model, blocks, inertia)
     force, torque = external(model, state, bodies, action)
     free, decay = compute_once(free_velocities(model, blocks, acting, halfway, force, torque), state.position)
-    problem = constrain(model, state, bodies, blocks, acting, free, halfway, gravity(model), action)
+    problem = constrain(model, bodies, blocks, acting, free, halfway, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
     if scene.restitution and scene.options.solver == "converged" and problem.contact_rows:
         last, _ = starting_impulses(model, state, problem, acting, packed)

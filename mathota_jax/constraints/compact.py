@@ -21,7 +21,7 @@ from mathota_jax.collision.broadphase import PairList, candidate_pairs
 from mathota_jax.collision.compact import compact_contacts, shapes_of_places
 from mathota_jax.collision.narrowphase import ContactSet, stored
 from mathota_jax.constraints.contact import ContactRows, Motion, PlacedPairs, contact_rows, rows_one_by_one
-from mathota_jax.constraints.flush import Ground, PlacedShape, decide, may_be_flush, is_slanted, lies_flush
+from mathota_jax.constraints.flush import Ground, PlacedShape, decide, is_slanted, lies_flush, may_be_flush
 from mathota_jax.model import Model
 from mathota_jax.scene import CompactGroup, Scene
 from mathota_jax.solver.colouring import edge_colours

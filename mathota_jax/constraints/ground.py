@@ -19,9 +19,9 @@ from mathota_jax.constraints.flush import (
     Ground,
     PlacedShape,
     decide,
-    may_be_flush,
     is_slanted,
     lies_flush,
+    may_be_flush,
 )
 from mathota_jax.model import Model
 from mathota_jax.scene import PairGroup, Scene

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -98,7 +99,6 @@ class Problem(NamedTuple):
 
 def constrain(
     model: Model,
-    state: State,
     bodies: Bodies,
     blocks: Bodies,
     inertia: Inertia,
@@ -110,7 +110,7 @@ def constrain(
     """Phases 2, 3 and 5: narrow phase and rows.
 
     Args:
-      model, state: parameters and state.
+      model: parameters and static scene.
       bodies, blocks: all bodies and the moving ones at the start of the step.
       inertia: with which the moving bodies respond to impulses.
       free: their velocities at the end of the step without constraints.
@@ -136,8 +136,8 @@ def constrain(
         order = joint_layout.joint_tables(scene)
         if decoupling.applies(scene):
             rows_of = substep_rows.joint_rows if small_steps else joint.decoupled_rows
-            found = [rows_of(scene, table, model, joint_motion) for table in order]
-            tables, decouplings = tuple(rows for rows, _ in found), tuple(how for _, how in found)
+            pairs = [rows_of(scene, table, model, joint_motion) for table in order]
+            tables, decouplings = tuple(rows for rows, _ in pairs), tuple(how for _, how in pairs)
         else:
             tables = tuple(joint.velocity_rows(scene, table, model, joint_motion) for table in order)
         if held is not None and (bounded := mechanism_layout.bounded_slots(scene)):
@@ -149,60 +149,82 @@ def constrain(
                 substep_rows.joint_error(scene, rows, model, joint_motion, how)
                 for rows, how in zip(tables, decouplings, strict=True)
             )
-    contacts, contact_rows, close, offsets, with_joints = None, [], None, None, None
+    found = _Contacts(None, [], None, None, None)
     if scene.slot_count:
-        found = own_contacts(model, bodies)
-        if scene.broadphase is not None:
-            close = compact.close_pairs(model, bodies, free)
-        ground, with_static = None, {}
-        if has_seams(scene):
-            with_static = {} if close is None else compact.contacts_with_static(model, bodies, close)
-            ground = find_ground(model, bodies, found[0] if found else None, close, with_static)
-            found = [without_flush(model, bodies, ground, own) for own in found]
-        if scene.options.continuous:
-            found = [contact.near_contacts(scene, model, own) for own in found]
-        now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
-        then = contact.pack_motion(scene, *free)
-        if held is not None:
-            # What presses a contact is what is left when the joints hold: a force beside a joint would turn its body.
-            then = with_joints = mechanism.hold(
-                held, tables, then, tuple(jnp.zeros_like(rows.bias) for rows in tables)
-            )[0]
-        inverse = compute_once(inertia.inverse(), state.position)
-        together = None if held is None else mechanism.mass_together(held.layout, inertia)
-        motion = contact.Motion(blocks.position, now, then, inverse, gravity, together)
-        if scene.pair_groups:
-            way, turn = ways(scene, bodies, now, then, model.dt), largest_turn(scene, bodies, free[1], model.dt)
-            own = found[0]._replace(apart=undisturbed(model, way, turn, found[0]))
-            contact_rows = [
-                contact.contact_rows(scene, table, model, own, motion) for table in contact.contact_tables(scene)
-            ]
-        if close is not None:
-            sets, more = compact.contacts_and_rows(model, bodies, close, motion, ground, with_static)
-            found, contact_rows = found + sets, contact_rows + more
-        if held is not None and scene.rebounds_may_gain:
-            contact_rows = rebound_limit.with_held_falling(held, contact_rows, gravity)
-        contacts = join_contacts(found)
-        offsets = contact_offsets(model, bodies, contacts, close)
+        found = _contacts(model, bodies, blocks, inertia, free, gravity, held, tables)
     if small_steps:
-        errors += tuple(substep_rows.contact_error(scene, group, model) for group in contact_rows)
+        errors += tuple(substep_rows.contact_error(scene, group, model) for group in found.rows)
     reduced = None
     if held is not None and mechanism_layout.takes_contacts(scene):
-        reduced = mechanism_contacts.reduce(scene, held, inertia, tables, contact_rows)
+        reduced = mechanism_contacts.reduce(scene, held, inertia, tables, found.rows)
     return Problem(
         joints,
         held,
         responses,
         tables,
-        contacts,
-        contact_rows,
-        close,
+        found.contacts,
+        found.rows,
+        found.close,
         errors,
         decouplings,
-        offsets,
+        found.offsets,
         reduced,
-        with_joints,
+        found.with_joints,
     )
+
+
+class _Contacts(NamedTuple):
+    """What touches, as in a `Problem`."""
+
+    contacts: ContactSet | None
+    rows: list[contact.ContactRows]
+    close: compact.ClosePairs | None
+    offsets: Vec3 | None
+    with_joints: Array | None
+
+
+def _contacts(
+    model: Model,
+    bodies: Bodies,
+    blocks: Bodies,
+    inertia: Inertia,
+    free: tuple[Vec3, Vec3],
+    gravity: Vec3,
+    held: mechanism_links.Links | None,
+    tables: Sequence[Rows],
+) -> _Contacts:
+    """Contacts and their rows; arguments as for `constrain`, mechanisms and the rows of the joints."""
+    scene = model.scene
+    found = own_contacts(model, bodies)
+    close = None if scene.broadphase is None else compact.close_pairs(model, bodies, free)
+    ground, with_static = None, {}
+    if has_seams(scene):
+        with_static = {} if close is None else compact.contacts_with_static(model, bodies, close)
+        ground = find_ground(model, bodies, found[0] if found else None, close, with_static)
+        found = [without_flush(model, bodies, ground, own) for own in found]
+    if scene.options.continuous:
+        found = [contact.near_contacts(scene, model, own) for own in found]
+    now = contact.pack_motion(scene, blocks.velocity, blocks.angular_velocity)
+    then, with_joints, together = contact.pack_motion(scene, *free), None, None
+    if held is not None:
+        # What presses a contact is what is left when the joints hold: a force beside a joint would turn its body.
+        nothing = tuple(jnp.zeros_like(rows.bias) for rows in tables)
+        then = with_joints = mechanism.hold(held, tables, then, nothing)[0]
+        together = mechanism.mass_together(held.layout, inertia)
+    inverse = compute_once(inertia.inverse(), bodies.position.x)
+    motion = contact.Motion(blocks.position, now, then, inverse, gravity, together)
+    rows = []
+    if scene.pair_groups:
+        way, turn = ways(scene, bodies, now, then, model.dt), largest_turn(scene, bodies, free[1], model.dt)
+        own = found[0]._replace(apart=undisturbed(model, way, turn, found[0]))
+        rows = [contact.contact_rows(scene, table, model, own, motion) for table in contact.contact_tables(scene)]
+    if close is not None:
+        sets, more = compact.contacts_and_rows(model, bodies, close, motion, ground, with_static)
+        found, rows = found + sets, rows + more
+    if held is not None and scene.rebounds_may_gain:
+        rows = rebound_limit.with_held_falling(held, rows, gravity)
+    contacts = join_contacts(found)
+    return _Contacts(contacts, rows, close, contact_offsets(model, bodies, contacts, close), with_joints)
 
 
 def starting_impulses(
