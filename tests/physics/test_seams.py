@@ -16,7 +16,6 @@ from mathota_jax import (
     Compound,
     Cone,
     Cylinder,
-    Heightfield,
     Plane,
     Polyhedron,
     SceneBuilder,
@@ -51,14 +50,9 @@ def tiles(kind):
     if kind == "compound":
         return [(Compound([(box, (place, UNTURNED)) for place in places]), (0, 0, 0))]
     if kind == "mixed":
-        # Discs, a hull, and a heightfield whose border ends beside them.
         hull = Polyhedron([(x, y, z) for x in (-0.75, 0.75) for y in (-0.25, 0.25) for z in (-2, 2)])
-        return [
-            (hull, places[0]),
-            (box, places[1]),
-            (Heightfield(np.zeros((4, 9)), 0.5), (0.75, 0, 0)),
-            (box, places[3]),
-        ]
+        part = Compound([(hull, (places[2], UNTURNED)), (Sphere(0.1), ((0.75, -0.3, 0), UNTURNED))])
+        return [(hull, places[0]), (box, places[1]), (part, (0, 0, 0)), (box, places[3])]
     return [(box, place) for place in places]
 
 
