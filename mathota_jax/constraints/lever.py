@@ -76,15 +76,6 @@ def levers(
     count = len(joint_rows)
     contact_rows = [_under_load(group, part) for group, part in zip(contact_rows, impulses[count:], strict=True)]
     total = jnp.zeros((6 if several else 2, *solved.shape[1:]), solved.dtype)
-    for group, impulse in zip(joint_rows, impulses[:count], strict=True):
-        # The linear part of the Jacobian makes a weight [N s] of the impulse, 0 for a row that only turns.
-        weights = [safe_sqrt(_square(side[:, :, :3])) for side in group.jacobian]
-        parts = [_weighted(weight, half) for weight in weights]
-        size = jnp.abs(impulse)
-        if several:
-            parts = [_with_movement(part, side, size, 0.0) for part, side in zip(parts, group.response, strict=True)]
-        total = add_changes(group, Dense((), tuple(parts)), total, size)
-    of_joints = total[:2]
     for group, impulse in zip(contact_rows, impulses[count:], strict=True):
         if several:
             # Relative to half the step, contacts at rest add nothing at all.
@@ -95,6 +86,15 @@ def levers(
             share = _weighted(jnp.ones_like(lever), lever)
             parts = (share,) * len(group.rows.jacobian)
             total = add_changes(group.rows, Dense((), parts), total, impulse[:, :1])
+    of_contacts = total[:2]
+    for group, impulse in zip(joint_rows, impulses[:count], strict=True):
+        # The linear part of the Jacobian makes a weight [N s] of the impulse, 0 for a row that only turns.
+        weights = [safe_sqrt(_square(side[:, :, :3])) for side in group.jacobian]
+        parts = [_weighted(weight, half) for weight in weights]
+        size = jnp.abs(impulse)
+        if several:
+            parts = [_with_movement(part, side, size, 0.0) for part, side in zip(parts, group.response, strict=True)]
+        total = add_changes(group, Dense((), tuple(parts)), total, size)
     mean = jnp.where(total[0] > 0, safe_divide(total[1], total[0]), half)
     beyond = None
     if several:
@@ -104,7 +104,7 @@ def levers(
         return mean, beyond
     found = layout(scene)
     assert found is not None
-    more = (solved - with_joints) * (_of_mechanisms(found, total[:2] - of_joints, half) - half)
+    more = (solved - with_joints) * (_of_mechanisms(found, of_contacts, half) - half)
     beyond = jnp.where(found.is_link[:, None], more, 0.0 if beyond is None else beyond)
     return jnp.where(found.is_link[:, None], half, mean), beyond
 
