@@ -7,15 +7,15 @@ import functools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 
+from mathota_jax.constraints import mechanism
 from mathota_jax.constraints.contact import ContactRows
-from mathota_jax.constraints.mechanism_layout import Layout, layout
+from mathota_jax.constraints.mechanism_layout import layout
 from mathota_jax.scene import Scene
 from mathota_jax.solver.row_matrix import Dense, RowMatrix, sum_over_points
 from mathota_jax.solver.rows import Rows, add_changes
-from mathota_jax.spatial.indexing import take, unstack
+from mathota_jax.spatial.indexing import unstack
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, store
 from mathota_jax.spatial.spread import add_slices, spread
@@ -104,26 +104,11 @@ def levers(
         return mean, beyond
     found = layout(scene)
     assert found is not None
-    more = (solved - with_joints) * (_of_mechanisms(found, of_contacts, half) - half)
+    weight, moment = unstack(mechanism.sum_by_mechanism(found, of_contacts), 0)
+    of_mechanism = jnp.where(weight > 0, safe_divide(moment, weight), half)
+    more = (solved - with_joints) * (of_mechanism - half)
     beyond = jnp.where(found.is_link[:, None], more, 0.0 if beyond is None else beyond)
     return jnp.where(found.is_link[:, None], half, mean), beyond
-
-
-def _of_mechanisms(found: Layout, total: Array, half: Array) -> Array:
-    """(block, world) mean lever of the contacts of the mechanism of each body, of any other body anything.
-
-    `total` (2, block, world) are the sums of weights, and of weights times levers, of the contacts of each body.
-    """
-    tree_of = np.zeros(found.block_count, int)
-    levers = []
-    for number, links in enumerate(found.trees):
-        blocks = [found.blocks[link] for link in links]
-        tree_of[blocks] = number
-        weight, moment = unstack(
-            jnp.broadcast_to(take(total, blocks, axis=1), (2, len(blocks), total.shape[-1])).sum(1), 0
-        )
-        levers.append(jnp.where(weight > 0, safe_divide(moment, weight), half))
-    return take(jnp.stack(jnp.broadcast_arrays(*levers)), tree_of)
 
 
 def _under_load(group: ContactRows, impulse: Array) -> ContactRows:

@@ -21,7 +21,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, mlir
 
-from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
+from mathota_jax.bodies import pack_blocks, unpack_blocks
 from mathota_jax.constraints import mechanism_loops
 from mathota_jax.constraints.assembly import collect, pack_scalars, select
 from mathota_jax.constraints.mechanism_layout import Layout, layout
@@ -197,15 +197,14 @@ def _respond_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     return found, jax.jvp(again, primals, tangents)[1]
 
 
-def mass_together(found: Layout, inertia: Inertia) -> Array:
-    """(block, world) mass of the mechanism of each moving body, of a body of none its own."""
-    mass = jnp.broadcast_to(1.0 / inertia.inverse_mass, (found.block_count, inertia.inverse_mass.shape[-1]))
-    number, masses = np.arange(found.block_count), [mass]
-    for tree_number, links in enumerate(found.trees):
+def sum_by_mechanism(found: Layout, values: Array) -> Array:
+    """Sums of values (..., block, world) over the mechanism of each moving body; of a body of none its own value."""
+    number, sums = np.arange(found.block_count), [values]
+    for place, links in enumerate(found.trees):
         blocks = [found.blocks[link] for link in links]
-        number[blocks] = found.block_count + tree_number
-        masses.append(jnp.broadcast_to(take(mass, blocks), (len(blocks), mass.shape[-1])).sum(0, keepdims=True))
-    return jnp.broadcast_to(take(jnp.concatenate(masses), number), mass.shape)
+        number[blocks] = found.block_count + place
+        sums.append(take(values, blocks, axis=-2).sum(-2, keepdims=True))
+    return jnp.broadcast_to(take(jnp.concatenate(sums, axis=-2), number, axis=-2), values.shape)
 
 
 def closing_shift(links: Links, errors: Impulses) -> Array:

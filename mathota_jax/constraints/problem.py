@@ -210,7 +210,8 @@ def _contacts(
         # What presses a contact is what is left when the joints hold: a force beside a joint would turn its body.
         nothing = tuple(jnp.zeros_like(rows.bias) for rows in tables)
         then = with_joints = mechanism.hold(held, tables, then, nothing)[0]
-        together = mechanism.mass_together(held.layout, inertia)
+        mass = jnp.broadcast_to(1.0 / inertia.inverse_mass, (len(scene.dynamic_bodies), inertia.inverse_mass.shape[-1]))
+        together = mechanism.sum_by_mechanism(held.layout, mass)
     inverse = compute_once(inertia.inverse(), bodies.position.x)
     motion = contact.Motion(blocks.position, now, then, inverse, gravity, together)
     rows = []

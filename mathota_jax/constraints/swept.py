@@ -91,28 +91,29 @@ def undisturbed(model: Model, way: Way, turn: Array, contacts: ContactSet) -> Ar
     scene = model.scene
     if not _may_miss(scene):
         return None
-    contacts, turn = lax.stop_gradient((contacts, turn))
-    strikes, first = [], 0
-    for group in scene.pair_groups:
-        found = take(contacts._replace(converged=None), range(first, first + group.slot_count))
-        strikes.append(_strikes(model, group, way, turn, found))
-        first += group.slot_count
-    deflection = DEFLECTION * _sum_by_body(scene, jnp.concatenate(strikes))
+    deflection = DEFLECTION * _sum_by_body(scene, _all_strikes(model, way, turn, contacts))
     apart = _by_slot(scene, [_stays_apart(model, group, way, deflection) for group in scene.pair_groups])
     return apart & np.asarray([[scene.jointed.isdisjoint(pair)] for pair in zip(*scene.slot_bodies, strict=True)])
 
 
 def may_strike(model: Model, way: Way, turn: Array, contacts: ContactSet) -> Array:
     """(pair, world) which pairs may meet elsewhere than at their contacts, since they turn; arguments as above."""
-    turn, found, first = lax.stop_gradient(turn), [], 0
+    groups = model.scene.pair_groups
+    turn = lax.stop_gradient(turn)
+    turns = take(turn, [b for g in groups for b in g.bodies_a]) + take(turn, [b for g in groups for b in g.bodies_b])
+    round_ones = [{g.kind_a, g.kind_b} <= {"plane", "sphere"} for g in groups for _ in g.bodies_a]
+    strikes = _all_strikes(model, way, turn, contacts) > 0
+    return strikes & (turns > LEAST_TURN) & ~np.asarray(round_ones)[:, None]
+
+
+def _all_strikes(model: Model, way: Way, turn: Array, contacts: ContactSet) -> Array:
+    """`_strikes` of the pairs with slots of their own, group by group; without derivative."""
+    contacts, turn = lax.stop_gradient((contacts._replace(converged=None), turn))
+    found, first = [], 0
     for group in model.scene.pair_groups:
         slots = range(first, first + group.slot_count)
+        found.append(_strikes(model, group, way, turn, take(contacts, slots)))
         first = slots.stop
-        of_group = take(lax.stop_gradient(contacts)._replace(converged=None, apart=None), slots)
-        turns = take(turn, group.bodies_a) + take(turn, group.bodies_b) > LEAST_TURN
-        round_ones = {group.kind_a, group.kind_b} <= {"plane", "sphere"}
-        strikes = _strikes(model, group, way, turn, of_group) > 0
-        found.append(jnp.zeros_like(strikes) if round_ones else strikes & turns)
     return jnp.concatenate(found)
 
 
