@@ -52,9 +52,10 @@ def shape_of(kind, sizes):
 
 
 def field_of(heights, cell=CELL, reach=0.5):
-    """Parameters of one heightfield, heights (rows, columns)."""
+    """Parameters of heightfields, heights (rows, columns) of one for all worlds or (rows, columns, 1, world)."""
+    heights = jnp.asarray(heights)
     return {
-        "heights": jnp.asarray(heights)[:, :, None, None],
+        "heights": heights.reshape(*heights.shape, *(1,) * (4 - heights.ndim)),
         "cell_size": jnp.reshape(cell, (1, 1)),
         "window": window_size(reach, float(CELL)),
     }

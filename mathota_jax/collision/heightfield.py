@@ -8,6 +8,8 @@ ground has no contact of its own, and no ghost normal.
 - Faces: the point of the body that is extreme against the face's normal.
 - Ridges: a search along the arc of normals by bisection; only the support function of the body is needed.
 - Peaks: the closed-form distance of a point from the body.
+- In the ground all three go by the height of the ground over the body's underside instead of the distance. Over each
+  triangle it is a concave function, so its highest value is at one of these places; the nearest way out need not be.
 - The points on which the body would stand on a plane, each against the triangle under it: they span the base.
 - Beside the field: the points nearest to the wall under its border, instead of what would lift the body over it.
 
@@ -29,6 +31,7 @@ from jax import Array, lax
 from mathota_jax.collision.candidates import LEAN, LEAN_SHARE, best_candidate, depth_tolerance, pick
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import (
+    DOWN,
     SEAM,
     Window,
     grid_window,
@@ -42,6 +45,7 @@ from mathota_jax.collision.height_grid import (
 from mathota_jax.collision.heightfield_ridges import looks_up, ridge_contacts
 from mathota_jax.collision.heightfield_walls import LEVEL, Wall, along_wall, depth_under, nearest_wall
 from mathota_jax.collision.manifold import ContactPoint, Manifold
+from mathota_jax.collision.rays import RAYS
 from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import compute_once, settle
@@ -163,8 +167,8 @@ def _face_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window)
     for index, core in enumerate(cores):
         height = height_over(faces.normal, faces.corner, core)
         foot = core - faces.normal * height
-        frozen = lax.stop_gradient((core, foot, height, faces.normal, faces.corner, cell))
-        valid = settle(_over_face(window, *frozen, faces.is_upper).astype(height.dtype)) > 0.5
+        frozen = lax.stop_gradient((core, foot, height, faces.corner, cell))
+        valid = settle(_over_face(*frozen, faces.is_upper).astype(height.dtype)) > 0.5
         feature = 2 * faces.number + index
         found.append(Candidates(foot, faces.normal, height - _inflation(kind, a), feature, valid))
     return found
@@ -198,17 +202,9 @@ def _on_wall(corner: Vec3, inflation: Any, feature: Array, window: Window, wall:
     return Candidates(foot, up, height - inflation, number, valid)
 
 
-def _over_face(
-    window: Window, core: Vec3, foot: Vec3, height: Array, normal: Vec3, corner: Vec3, cell: Any, is_upper: Any
-) -> Array:
-    """Whether a point leaves the ground through a triangle (or has it as its nearest)."""
-    foot_inside = margin(foot, corner, is_upper, cell) >= -SEAM
-    column_inside = margin(core, corner, is_upper, cell) >= -SEAM
-    ground = lax.stop_gradient(ground_at(window, core))
-    # Inside a ridge the plane beyond the crest is above the ground over the point; only in a valley it is below.
-    over = height_over(ground.normal, ground.corner, core) / ground.normal.y
-    valley = ground.exists & (height / normal.y >= over - SEAM * cell)
-    return jnp.where(height >= 0, foot_inside, column_inside | (foot_inside & valley))
+def _over_face(core: Vec3, foot: Vec3, height: Array, corner: Vec3, cell: Any, is_upper: Any) -> Array:
+    """Whether a triangle is nearest to a point above it or is straight over one in the ground."""
+    return margin(where(height >= 0, foot, core), corner, is_upper, cell) >= -SEAM
 
 
 def _ridges(
@@ -237,6 +233,10 @@ def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window, level
         return found.normal, found.points[0].separation
 
     up, separation = jax.vmap(distance)(points)
+    if known.flat_contacts is not None:  # the core of the others is too thin for a point to be in it
+        outward, rise, overlaps = _lifts_over(known.name, a, body, points)
+        overlaps = settle((overlaps & ~at_border).astype(rise.dtype)) > 0.5
+        up, separation = where(overlaps, outward, up), jnp.where(overlaps, -rise * outward.y, separation)
     direction = lax.stop_gradient(up)
     cell = lax.stop_gradient(window.field["cell_size"])
     valid = complete & looks_up(direction, at_border, level)
@@ -245,6 +245,20 @@ def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window, level
         valid &= ~present | (dot(direction, lax.stop_gradient(way)) < slack)
     valid = settle(valid.astype(separation.dtype)) > 0.5
     return Candidates(points, up, separation, 8 * _grid_count(window) + number, valid)
+
+
+def _lifts_over(kind: str, a: dict[str, Any], body: Pose, points: Vec3) -> tuple[Vec3, Array, Array]:
+    """The body's underside below grid points (point, pair, world).
+
+    Returns:
+        Its normal into the body, how far [m] the points are above it, and whether they are.
+    """
+    below = DOWN * lax.stop_gradient(bounding_radius(kind, a))
+    zero = jnp.zeros_like(points.x[0])
+    straight_up = Vec3(zero, zero + 1.0, zero)
+    hit = jax.vmap(lambda point: RAYS[kind](a, body, point._replace(y=point.y - below), straight_up))(points)
+    rise = below - hit.distance
+    return -hit.normal, rise, hit.hit & (rise > 0)
 
 
 def _bends_down(ways: list[tuple[Vec3, np.ndarray]], cell: Array) -> Array:

@@ -13,7 +13,7 @@ from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import Edges, Window, edges
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle, settle_code
-from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm, normalize, where
+from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, normalize, where
 
 BISECTIONS = 16
 """Halvings of the arc; a Newton step makes the direction exact."""
@@ -43,12 +43,16 @@ class Ridges(NamedTuple):
 
 
 class _Extreme(NamedTuple):
-    """Direction on the arc where the parting is best, and the pieces of the body that are extreme on either side."""
+    """Direction on the arc where the parting is best, and the pieces of the body that are extreme on either side.
+
+    `overlaps` says where the body is in the ground there.
+    """
 
     up: Vec3
     piece_minus: Array
     piece_plus: Array
     interior: Array
+    overlaps: Array
 
 
 def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, level: Array) -> Ridges:
@@ -57,6 +61,10 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window,
     The parting ``g(up) = min over the body of up . (x - ridge)`` has the derivative ``(along x up) . (x - ridge)``; at
     its maximum on the arc either one piece of the body is straight over the ridge or two pieces tie. That condition
     determines the direction differentiably; the derivative of the parting does not depend on it (envelope theorem).
+
+    Where the body is in the ground, `up` is scaled to height 1 instead of length 1: ``-g`` is then the height of the ridge
+    over the body's underside, and the condition is that a piece is straight under the ridge. Both are quasi-concave on
+    the arc, and so is their union, as their signs agree.
     """
     edge = edges(window, size)
     found = _search(kind, *lax.stop_gradient((a, rotation, edge)))
@@ -64,16 +72,18 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window,
     exact, *_ = _step(kind, *lax.stop_gradient((a, rotation, edge)), found)
     up, across, one, other = _step(kind, a, rotation, edge, found._replace(up=lax.stop_gradient(exact)))
     same = found.piece_minus == found.piece_plus
-    length = norm(edge.span)
     along = normalize(edge.span)
-    first, second = dot(across, one), dot(across, other)
+    change = _toward_plus(along, across, found.overlaps)
+    first, second = dot(change, one), dot(change, other)
     share = jnp.where(same, 0.0, clamp(safe_divide(first, first - second), 0.0, 1.0))
     body = one + (other - one) * share
     separation = dot(up, body)
-    run = dot(along, body)
-    ground = edge.start + along * run
-    valid = lax.stop_gradient((run >= -CONVEX * length) & (run <= (1.0 + CONVEX) * length))
-    at_border = (edge.minus.y == 0) | (edge.plus.y == 0)
+    ground = edge.start + body - up * separation
+    # Of a body in the ground the place is straight above it.
+    way, body = lax.stop_gradient((edge.span._replace(y=jnp.where(found.overlaps, 0.0, edge.span.y)), body))
+    run = dot(way, body) / dot(way, way)
+    valid = (run >= -CONVEX) & (run <= 1.0 + CONVEX)
+    at_border = _is_border(edge)
     valid &= looks_up(lax.stop_gradient(up), at_border, level) | (edge.upright & ~level)
     valid = settle((valid & found.interior).astype(run.dtype)) > 0.5
     return Ridges(ground, up, separation, edge.number, valid, at_border)
@@ -86,6 +96,16 @@ def looks_up(direction: Vec3, at_border: Array, level: Array) -> Array:
     over what it is about to slide over.
     """
     return direction.y > jnp.where(at_border, jnp.where(level, OVER, -BEYOND), 0.0)
+
+
+def _is_border(edge: Edges) -> Array:
+    """Whether the ground ends in a wall there; it has no height on that side."""
+    return (edge.minus.y == 0) | (edge.plus.y == 0)
+
+
+def _toward_plus(along: Vec3, across: Vec3, overlaps: Array) -> Vec3:
+    """How the direction changes along the arc: turned, or in the ground moved at one height."""
+    return where(overlaps, cross(along, Vec3(0.0, 1.0, 0.0)), across)
 
 
 def _step(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, found: _Extreme) -> tuple[Vec3, Vec3, Vec3, Vec3]:
@@ -108,7 +128,7 @@ def _step(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, found: _Ext
 
     def condition(angle: Array) -> Array:
         up, across, one, other = turned(angle)
-        return jnp.where(same, dot(across, one), dot(up, one - other))
+        return jnp.where(same, dot(_toward_plus(along, across, found.overlaps), one), dot(up, one - other))
 
     zero = jnp.zeros_like(along.x + found.up.x)
     value, rate = jax.jvp(condition, (zero,), (jnp.ones_like(zero),))
@@ -119,6 +139,7 @@ def _step(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, found: _Ext
 def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extreme:
     along = normalize(edge.span)
     arc = edge.plus - edge.minus
+    can_overlap = ~_is_border(edge)
 
     def evaluate(share: Array) -> tuple[Array, Array]:
         """Piece of the body and whether the parting grows toward the plus side, as one settled number each."""
@@ -126,7 +147,9 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extre
         local = rotation.apply_transposed(-up)
         code = SUPPORT[kind].code(a, local)
         point = rotation.apply(SUPPORT[kind].point(a, code, local))
-        grows = dot(cross(along, up), point - edge.start) > 0
+        point = point - edge.start
+        overlaps = (dot(up, point) < 0) & can_overlap
+        grows = dot(_toward_plus(along, cross(along, up), overlaps), point) > 0
         return code, settle_code(grows.astype(share.dtype))
 
     zero = jnp.zeros_like(along.x)
@@ -154,4 +177,6 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extre
     state = tuple(jnp.broadcast_to(x, shape) for x in (low, high, piece_minus, piece_plus))
     low, high, piece_minus, piece_plus = lax.fori_loop(0, BISECTIONS, halve, state)
     up = normalize(where(interior, edge.minus + arc * (0.5 * (low + high)), edge.minus))
-    return _Extreme(up, piece_minus, piece_plus, interior)
+    point = rotation.apply(SUPPORT[kind].point(a, piece_minus, rotation.apply_transposed(-up))) - edge.start
+    overlaps = settle(((dot(up, point) < 0) & can_overlap).astype(point.x.dtype)) > 0.5
+    return _Extreme(up, piece_minus, piece_plus, interior, overlaps)

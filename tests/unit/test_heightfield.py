@@ -267,7 +267,7 @@ def deepest(kind, position, orientation, heights, cell, sizes):
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_are_those_of_differences(kind, float64, gate):
     """By the pose, the heights, the cell size and the sizes of the body, along random directions."""
-    count, step = 60, 1e-6
+    count, step = 60, 1e-7
     position, orientation = over_the_hills(kind, count, 12)
     position[:, 1] += 0.1
     arguments = (position, orientation, HILLS, np.array(CELL), SIZES[kind])
@@ -287,7 +287,9 @@ def test_derivatives_are_those_of_differences(kind, float64, gate):
     same = active & (feature == ahead[2]) & (feature == behind[2])
     assert same.sum() > 0.8 * count
     difference = (ahead[0] - behind[0]) / (2 * step)
-    gate("derivative", jnp.where(same[:, None], rate - difference, 0.0), 1e-6)
+    # The normal of an edge nearly parallel to a ridge turns so fast that its difference is good to its size only.
+    error = (rate - difference) / jnp.maximum(1.0, jnp.abs(rate))
+    gate("derivative", jnp.where(same[:, None], error, 0.0), 1e-6)
     # Reverse mode: the same numbers, and none that is not finite.
     weights = jnp.asarray(rng.normal(size=rate.shape))
     gradient = jax.jit(jax.grad(lambda x: jnp.sum(weights * deepest(kind, *x)[0])))(arguments)
