@@ -235,9 +235,9 @@ def _reusable(result: tuple[State, Solved], model: Model, state: State, action: 
     new, found = result
     if found.mechanisms is not None:
         return found._replace(uncut=None)
-    options = model.scene.options
+    scene = model.scene
     # Sleeping islands keep the forces of another step; small steps and impacts share out theirs among their parts.
-    if options.sleep or options.impact_events or options.solver == "soft_step":
+    if scene.options.sleep or scene.splits_at_impacts or scene.options.solver == "soft_step":
         return None
     return found if found.uncut is not None else Solved(Forces(new.joint_force, new.contact_force))
 

@@ -43,13 +43,13 @@ from mathota_jax.collision.height_grid import (
     triangles,
 )
 from mathota_jax.collision.heightfield_ridges import looks_up, ridge_contacts
-from mathota_jax.collision.heightfield_walls import LEVEL, Wall, along_wall, depth_under, nearest_wall
+from mathota_jax.collision.heightfield_walls import LEVEL, Wall, along_wall, depth_under, inside_border, nearest_wall
 from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.collision.rays import RAYS
 from mathota_jax.geometry.bounds import bounding_radius
 from mathota_jax.spatial.pose import Pose
 from mathota_jax.spatial.settle import compute_once, settle
-from mathota_jax.spatial.spread import least
+from mathota_jax.spatial.spread import greatest
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, norm, where
 
 FLAT = 1e-5
@@ -119,10 +119,8 @@ def heightfield_contacts(known: Kind, a: dict[str, Any], pose_a: Pose, b: dict[s
     size = lax.stop_gradient(bounding_radius(kind, a)) + jnp.zeros_like(center.x)
 
     wall = nearest_wall(kind, a, rotation, window, size)
-    ridges, at_border = _ridges(kind, a, rotation, window, size, wall.level)
-    upper = _joined(
-        [*_face_contacts(kind, a, rotation, window), ridges, _peaks(known, a, rotation, window, wall.level)]
-    )
+    ridges, at_border = _ridges(kind, a, rotation, window, size, wall)
+    upper = _joined([*_face_contacts(kind, a, rotation, window), ridges, _peaks(known, a, rotation, window, wall)])
     # What lies deeper than the wall would lift a body over the border that comes in from beside.
     lifts = wall.beside & (lax.stop_gradient(upper.separation) < -wall.way - MERGE * size)
     upper = upper._replace(valid=upper.valid & ~lifts)
@@ -131,11 +129,13 @@ def heightfield_contacts(known: Kind, a: dict[str, Any], pose_a: Pose, b: dict[s
     else:
         base = _base(known.flat_contacts, a, rotation, window, upper, wall, size)
     candidates = _joined([upper, base])
-    # The same holds for an edge of a wall; in between the body lies on both.
+    # The same holds for an edge of a wall, near it; in between the body lies on both.
     overlap = jnp.where(ridges.valid & at_border, -lax.stop_gradient(ridges.separation), 0.0)
-    way_out = least(jnp.where(overlap > 0, overlap, ABSENT * size)) + LEVEL * size
-    shallow = lax.stop_gradient(candidates.separation) > -way_out
-    candidates = candidates._replace(valid=candidates.valid & (settle(shallow.astype(size.dtype)) > 0.5))
+    way_out = greatest(overlap)
+    way_out = jnp.where(way_out > 0, way_out + LEVEL * size, ABSENT * size)
+    remains = lax.stop_gradient(candidates.separation) > -way_out
+    remains |= inside_border(window, lax.stop_gradient(candidates.ground)) > way_out
+    candidates = candidates._replace(valid=candidates.valid & (settle(remains.astype(size.dtype)) > 0.5))
     chosen = _reduced(candidates, size, base.separation.shape[0])
     return _manifold(candidates, chosen, size, pose_a, pose_b)
 
@@ -208,10 +208,10 @@ def _over_face(core: Vec3, foot: Vec3, height: Array, corner: Vec3, cell: Any, i
 
 
 def _ridges(
-    kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, level: Array
+    kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, wall: Wall
 ) -> tuple[Candidates, Array]:
     """Contacts of ridges, and which of them are those of the border."""
-    ridge = ridge_contacts(kind, a, rotation, window, size, level)
+    ridge = ridge_contacts(kind, a, rotation, window, size, wall)
     number, separation = 4 * _grid_count(window) + ridge.number, ridge.separation - _inflation(kind, a)
     return Candidates(ridge.ground, ridge.up, separation, number, ridge.valid), ridge.at_border
 
@@ -221,7 +221,7 @@ def _grid_count(window: Window) -> int:
     return rows * columns
 
 
-def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window, level: Array) -> Candidates:
+def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window, wall: Wall) -> Candidates:
     """Grid points against the body, where the direction looks out of the ground."""
     ways, complete, at_border, number = peak_cones(window)
     points = window.points.map(listed)
@@ -233,16 +233,24 @@ def _peaks(known: Kind, a: dict[str, Any], rotation: Mat3, window: Window, level
         return found.normal, found.points[0].separation
 
     up, separation = jax.vmap(distance)(points)
+    cell = lax.stop_gradient(window.field["cell_size"])
+    slack = jnp.where(_bends_down(ways, cell), LEANING, -FLAT) * cell
+
+    def looks_out(up: Vec3) -> Array:
+        direction = lax.stop_gradient(up)
+        found = complete & looks_up(direction, at_border, wall.level)
+        for way, present in ways:
+            found &= ~present | (dot(direction, lax.stop_gradient(way)) < slack)
+        return found
+
+    valid = looks_out(up)
     if known.flat_contacts is not None:  # the core of the others is too thin for a point to be in it
         outward, rise, overlaps = _lifts_over(known.name, a, body, points)
-        overlaps = settle((overlaps & ~at_border).astype(rise.dtype)) > 0.5
+        # At a wall the nearest way out comes first.
+        overlaps &= ~at_border | (~wall.beside & ~valid)
+        overlaps = settle(overlaps.astype(rise.dtype)) > 0.5
         up, separation = where(overlaps, outward, up), jnp.where(overlaps, -rise * outward.y, separation)
-    direction = lax.stop_gradient(up)
-    cell = lax.stop_gradient(window.field["cell_size"])
-    valid = complete & looks_up(direction, at_border, level)
-    slack = jnp.where(_bends_down(ways, cell), LEANING, -FLAT) * cell
-    for way, present in ways:
-        valid &= ~present | (dot(direction, lax.stop_gradient(way)) < slack)
+        valid = jnp.where(overlaps, looks_out(outward), valid)
     valid = settle(valid.astype(separation.dtype)) > 0.5
     return Candidates(points, up, separation, 8 * _grid_count(window) + number, valid)
 

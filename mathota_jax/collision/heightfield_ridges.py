@@ -11,6 +11,7 @@ from jax import Array, lax
 from mathota_jax.collision.closest import clamp
 from mathota_jax.collision.convex.support import SUPPORT
 from mathota_jax.collision.height_grid import Edges, Window, edges
+from mathota_jax.collision.heightfield_walls import Wall
 from mathota_jax.spatial.safe import safe_divide
 from mathota_jax.spatial.settle import settle, settle_code
 from mathota_jax.spatial.vector import Mat3, Vec3, cross, dot, normalize, where
@@ -55,7 +56,7 @@ class _Extreme(NamedTuple):
     overlaps: Array
 
 
-def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, level: Array) -> Ridges:
+def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, wall: Wall) -> Ridges:
     """Contacts with all edges of the window that are ridges, for bodies of that size [m], level with the border or not.
 
     The parting ``g(up) = min over the body of up . (x - ridge)`` has the derivative ``(along x up) . (x - ridge)``; at
@@ -67,7 +68,7 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window,
     the arc, and so is their union, as their signs agree.
     """
     edge = edges(window, size)
-    found = _search(kind, *lax.stop_gradient((a, rotation, edge)))
+    found = _search(kind, *lax.stop_gradient((a, rotation, edge)), wall.beside)
     # The bisection's direction is made exact first: a step from an inexact one has inexact derivatives.
     exact, *_ = _step(kind, *lax.stop_gradient((a, rotation, edge)), found)
     up, across, one, other = _step(kind, a, rotation, edge, found._replace(up=lax.stop_gradient(exact)))
@@ -84,7 +85,7 @@ def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window,
     run = dot(way, body) / dot(way, way)
     valid = (run >= -CONVEX) & (run <= 1.0 + CONVEX)
     at_border = _is_border(edge)
-    valid &= looks_up(lax.stop_gradient(up), at_border, level) | (edge.upright & ~level)
+    valid &= looks_up(lax.stop_gradient(up), at_border, wall.level) | (edge.upright & ~wall.level)
     valid = settle((valid & found.interior).astype(run.dtype)) > 0.5
     return Ridges(ground, up, separation, edge.number, valid, at_border)
 
@@ -136,24 +137,29 @@ def _step(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, found: _Ext
     return turned(clamp(angle, -LARGEST_CORRECTION, LARGEST_CORRECTION))
 
 
-def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extreme:
+def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, beside: Array) -> _Extreme:
     along = normalize(edge.span)
     arc = edge.plus - edge.minus
-    can_overlap = ~_is_border(edge)
 
-    def evaluate(share: Array) -> tuple[Array, Array]:
-        """Piece of the body and whether the parting grows toward the plus side, as one settled number each."""
+    def evaluate(share: Array) -> tuple[Array, Array, Array]:
+        """Piece of the body and whether the parting grows toward the plus side, as one settled number each.
+
+        The last one where the body in the ground goes by heights.
+        """
         up = normalize(edge.minus + arc * share)
         local = rotation.apply_transposed(-up)
         code = SUPPORT[kind].code(a, local)
-        point = rotation.apply(SUPPORT[kind].point(a, code, local))
-        point = point - edge.start
-        overlaps = (dot(up, point) < 0) & can_overlap
-        grows = dot(_toward_plus(along, cross(along, up), overlaps), point) > 0
-        return code, settle_code(grows.astype(share.dtype))
+        point = rotation.apply(SUPPORT[kind].point(a, code, local)) - edge.start
+        across = cross(along, up)
+        changes = (across, _toward_plus(along, across, dot(up, point) < 0))
+        return code, *(settle_code((dot(change, point) > 0).astype(share.dtype)) for change in changes)
 
     zero = jnp.zeros_like(along.x)
-    pieces, grows = evaluate(jnp.stack([zero - BEYOND, zero, zero + 1.0, zero + 1.0 + BEYOND]))
+    pieces, turning, rising = evaluate(jnp.stack([zero - BEYOND, zero, zero + 1.0, zero + 1.0 + BEYOND]))
+    # Beside a wall there is no height: what is beside the field, or has a way out there, does without.
+    by_height = ~_is_border(edge) | (~beside & ~((turning[0] == 1) & (turning[3] == 0)))
+    by_height &= ~edge.upright
+    grows = jnp.where(by_height, rising, turning)
     # Within the arc first: of a body that overlaps, the parting may grow again beyond the ends.
     within = (grows[1] == 1) & (grows[2] == 0)
     low, high = jnp.where(within, 0.0, -BEYOND) + zero, jnp.where(within, 1.0, 1.0 + BEYOND) + zero
@@ -164,8 +170,8 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extre
     def halve(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, piece_minus, piece_plus = state
         middle = 0.5 * (low + high)
-        code, grows = evaluate(middle)
-        up = grows == 1
+        code, turning, rising = evaluate(middle)
+        up = jnp.where(by_height, rising, turning) == 1
         return (
             jnp.where(up, middle, low),
             jnp.where(up, high, middle),
@@ -178,5 +184,5 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges) -> _Extre
     low, high, piece_minus, piece_plus = lax.fori_loop(0, BISECTIONS, halve, state)
     up = normalize(where(interior, edge.minus + arc * (0.5 * (low + high)), edge.minus))
     point = rotation.apply(SUPPORT[kind].point(a, piece_minus, rotation.apply_transposed(-up))) - edge.start
-    overlaps = settle(((dot(up, point) < 0) & can_overlap).astype(point.x.dtype)) > 0.5
+    overlaps = settle(((dot(up, point) < 0) & by_height).astype(point.x.dtype)) > 0.5
     return _Extreme(up, piece_minus, piece_plus, interior, overlaps)

@@ -81,12 +81,15 @@ def depth_under(window: Window, point: Vec3) -> Array:
     return -height_over(ground.normal, ground.corner, point) / ground.normal.y
 
 
+def inside_border(window: Window, point: Vec3) -> Array:
+    """How far [m] points (..., pair, world) are from the nearest wall, seen from above; negative beside the field."""
+    half_x, half_z = _halves(window)
+    return jnp.minimum(half_x - jnp.abs(point.x + window.center.x), half_z - jnp.abs(point.z + window.center.z))
+
+
 def along_wall(window: Window, point: Vec3) -> Array:
     """Whether points on a wall (..., pair, world) are between its two ends."""
-    slack = SEAM * window.field["cell_size"]
-    half_x, half_z = _halves(window)
-    inside = jnp.abs(point.x + window.center.x) <= half_x + slack
-    return inside & (jnp.abs(point.z + window.center.z) <= half_z + slack)
+    return inside_border(window, point) >= -SEAM * window.field["cell_size"]
 
 
 def _halves(window: Window) -> tuple[Array, Array]:

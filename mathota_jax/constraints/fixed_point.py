@@ -4,6 +4,9 @@ At the solution ``x = U(x, A x + b)`` with the laws U of all rows, so ``(1 - K -
 U by impulses and errors, and dU what U changes at fixed impulses. Redundant rows make the system singular, but consistent:
 proximal steps as in `solver.implicit`. Sweeps find dx slowly where stiff drives connect feet that stick: these pull against
 each other through the legs, which give way by next to nothing, and a derivative that has not converged creeps.
+
+Of a face whose sweeps end while the errors of its points do not fit one another, the right side holds what no impulses
+answer to. It is taken out first; over delta it would be velocities where points slide in several directions.
 """
 
 from __future__ import annotations
@@ -25,11 +28,13 @@ from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once
 
 DELTA = {"float32": 1e-4, "float64": 1e-6}
-"""Weight of the proximal term beside 1. Where redundant rows are not quite consistent, because the impulses are not quite
-solved, its inverse is what that grows by: with 1e-10 in float64 a slope was three times too large."""
+"""Weight of the proximal term beside 1."""
 
 STEPS = 3
 """Proximal steps. Each leaves the share delta / (delta + s) of the error along a mode of stiffness s."""
+
+PASSES = 2
+"""So often what nothing answers to is taken out. Each time a share of round-off over delta remains."""
 
 
 @jax.custom_jvp
@@ -92,6 +97,12 @@ def _solve(system: Array, right: Array) -> Array:
     factors = lax.linalg.lu(system + delta * jnp.eye(system.shape[-1], dtype=system.dtype))[:2]
     right = right.T
     solve = jax.vmap(lambda lu, pivots, right: lu_solve((lu, pivots), right))
+    for _ in range(PASSES):
+        # A step leaves of the right side delta times what it finds: in the end what nothing answers to.
+        left = right
+        for _ in range(STEPS):
+            left = delta * solve(*factors, left)
+        right = right - left
     found = jnp.zeros_like(right)
     for _ in range(STEPS):
         found = solve(*factors, right + delta * found)

@@ -134,7 +134,7 @@ def layout(scene: Scene) -> Layout | None:
     """The mechanisms of a scene; None where there is none, or where joints are left to the solver."""
     options = scene.options
     # Between impacts bodies follow paths of constant force, which a closing of the joints would leave.
-    if options.impact_events or not options.exact_joints:
+    if scene.splits_at_impacts or not options.exact_joints:
         return None
     found = _of_trees(scene, 1)
     if found is None or options.solver in ("soft_step", "converged") or _has_no_others(scene, found):

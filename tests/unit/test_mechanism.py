@@ -199,6 +199,7 @@ def test_which_joints_are_links():
     assert count(chain(4)) == 4
     assert count(chain(4), exact_joints=False) == 0
     assert count(chain(4), solver="soft_step") == 4
+    assert count(chain(4), impact_events=1) == 4  # nothing bounces
     loop = found(chain(4, lambda builder, ground: builder.add_joint(Hinge(4, ground, (4.5, 0, 0), (0, 0, 1)))))
     assert loop is not None and len(loop.links) == 4 and len(loop.closings) == 1 and len(loop.closing_slots) == 5
     rope = Distance(2, 4, anchor=(2, 0, 0), lengths=(0, 5))
