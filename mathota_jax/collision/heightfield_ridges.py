@@ -151,8 +151,11 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, beside: A
         code = SUPPORT[kind].code(a, local)
         point = rotation.apply(SUPPORT[kind].point(a, code, local)) - edge.start
         across = cross(along, up)
-        changes = (across, _toward_plus(along, across, dot(up, point) < 0))
-        return code, *(settle_code((dot(change, point) > 0).astype(share.dtype)) for change in changes)
+
+        def grows(change: Vec3) -> Array:
+            return settle_code((dot(change, point) > 0).astype(share.dtype))
+
+        return code, grows(across), grows(_toward_plus(along, across, dot(up, point) < 0))
 
     zero = jnp.zeros_like(along.x)
     pieces, turning, rising = evaluate(jnp.stack([zero - BEYOND, zero, zero + 1.0, zero + 1.0 + BEYOND]))
