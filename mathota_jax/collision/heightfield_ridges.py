@@ -141,24 +141,21 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, beside: A
     along = normalize(edge.span)
     arc = edge.plus - edge.minus
 
-    def evaluate(share: Array) -> tuple[Array, Array, Array]:
+    def evaluate(share: Array, *by_height: Array | bool) -> tuple[Array, ...]:
         """Piece of the body and whether the parting grows toward the plus side, as one settled number each.
 
-        The last one where the body in the ground goes by heights.
+        The latter for each choice of where it goes by heights if the body is in the ground.
         """
         up = normalize(edge.minus + arc * share)
         local = rotation.apply_transposed(-up)
         code = SUPPORT[kind].code(a, local)
         point = rotation.apply(SUPPORT[kind].point(a, code, local)) - edge.start
-        across = cross(along, up)
-
-        def grows(change: Vec3) -> Array:
-            return settle_code((dot(change, point) > 0).astype(share.dtype))
-
-        return code, grows(across), grows(_toward_plus(along, across, dot(up, point) < 0))
+        across, overlaps = cross(along, up), dot(up, point) < 0
+        rates = [dot(_toward_plus(along, across, overlaps & chosen), point) for chosen in by_height]
+        return code, *(settle_code((rate > 0).astype(share.dtype)) for rate in rates)
 
     zero = jnp.zeros_like(along.x)
-    pieces, turning, rising = evaluate(jnp.stack([zero - BEYOND, zero, zero + 1.0, zero + 1.0 + BEYOND]))
+    pieces, turning, rising = evaluate(jnp.stack([zero - BEYOND, zero, zero + 1.0, zero + 1.0 + BEYOND]), False, True)
     # Beside a wall there is no height: what is beside the field, or has a way out there, does without.
     by_height = ~_is_border(edge) | (~beside & ~((turning[0] == 1) & (turning[3] == 0)))
     by_height &= ~edge.upright
@@ -173,8 +170,8 @@ def _search(kind: str, a: dict[str, Any], rotation: Mat3, edge: Edges, beside: A
     def halve(_: Array, state: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, piece_minus, piece_plus = state
         middle = 0.5 * (low + high)
-        code, turning, rising = evaluate(middle)
-        up = jnp.where(by_height, rising, turning) == 1
+        code, grows = evaluate(middle, by_height)
+        up = grows == 1
         return (
             jnp.where(up, middle, low),
             jnp.where(up, high, middle),
