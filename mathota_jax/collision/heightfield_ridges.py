@@ -57,7 +57,7 @@ class _Extreme(NamedTuple):
 
 
 def ridge_contacts(kind: str, a: dict[str, Any], rotation: Mat3, window: Window, size: Array, wall: Wall) -> Ridges:
-    """Contacts with all edges of the window that are ridges, for bodies of that size [m], level with the border or not.
+    """Contacts with all edges of the window that are ridges, for bodies of that size [m] with that wall next to them.
 
     The parting ``g(up) = min over the body of up . (x - ridge)`` has the derivative ``(along x up) . (x - ridge)``; at
     its maximum on the arc either one piece of the body is straight over the ridge or two pieces tie. That condition

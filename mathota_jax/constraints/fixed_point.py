@@ -98,13 +98,15 @@ def _solve(system: Array, right: Array) -> Array:
     factors = lax.linalg.lu(system + DELTA * jnp.eye(system.shape[-1], dtype=system.dtype))[:2]
     right = right.T
     solve = jax.vmap(lambda lu, pivots, right: lu_solve((lu, pivots), right))
-    for _ in range(PASSES):
-        # A step leaves of the right side delta times what it finds: in the end what nothing answers to.
-        left = right
+
+    def steps(right: Array) -> tuple[Array, Array]:
+        """What they find, and what they leave of the right side."""
+        found, left = jnp.zeros_like(right), right
         for _ in range(STEPS):
-            left = DELTA * solve(*factors, left)
-        right = right - left
-    found = jnp.zeros_like(right)
-    for _ in range(STEPS):
-        found = solve(*factors, right + DELTA * found)
-    return found.T
+            way = solve(*factors, left)
+            found, left = found + way, DELTA * way
+        return found, left
+
+    for _ in range(PASSES):
+        right = right - steps(right)[1]
+    return steps(right)[0].T

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.heightfields import CELL, REACH, SIZES, STONE, STONE_FACES, run
 from tests.marks import slow_but
-from tests.unit.test_heightfield import KINDS, surface
+from tests.unit.test_heightfield import KINDS, grid_points, surface
 
 ROWS, COLUMNS = 25, 26
 
@@ -52,8 +52,8 @@ def depth_in(kind, points):
 def samples(heights, position, reach):
     """Points of the ground within reach of a body, those of the grid and on its lines among them."""
     sides = []
-    for axis, count in ((0, ROWS), (2, COLUMNS)):
-        lines = (np.arange(count) - 0.5 * (count - 1)) * CELL
+    grid = grid_points(heights)
+    for axis, lines in ((0, grid[:, 0, 0]), (2, grid[0, :, 2])):
         side = np.concatenate([position[axis] + np.linspace(-reach, reach, 25), lines])
         sides.append(side[(np.abs(side - position[axis]) <= reach) & (np.abs(side) <= lines[-1])])
     x, z = (side.ravel() for side in np.meshgrid(*sides, indexing="ij"))
