@@ -344,7 +344,7 @@ def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.
     # What the matrix changes at these impulses: it has no derivative of its own.
     left = take(reduced.rates(change(found)), chosen)
     rows = mechanism_contacts.with_errors(rows, left - lax.stop_gradient(left))
-    return change(pgs.solve(0, _gradient_iterations(scene, rows, iterations), rows, still, found)[1])
+    return change(pgs.as_swept(iterations, rows, found))
 
 
 def close_joints(

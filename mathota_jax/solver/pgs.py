@@ -72,32 +72,69 @@ def solve(
         return compute_once((velocity, impulses), velocity)
     biases = tuple(group.bias for group in rows)
     laws = tuple(group.law.starting(impulse) for group, impulse in zip(rows, impulses, strict=True))
-
-    def longer(number: Array | int) -> Array:
-        """Factor on the normal steps of a sweep."""
-        return jnp.where(number < iterations - PLAIN_SWEEPS, OVER_RELAXATION, 1.0).astype(velocity.dtype)
-
-    def relaxed(law: Any, bias: Array, factor: Array) -> Any:
-        # A contact that bounces is alone for the most part, and its exact step ends at once. Longer ones leave an error
-        # of 1e-4, by which elastic boxes that bounce on their faces were measured to begin to spin.
-        return law.relaxed(jnp.where(bias[0] >= 0, factor, 1.0).astype(bias.dtype))
-
     if momentum is None or iterations == 1 or not _couple(rows):
-
-        def of_number(number: Array | int) -> Update:
-            return sweeps.of_law(lambda law, bias: relaxed(law, bias, longer(number)))
-
-        return sweeps.run(iterations, rows, of_number, laws, biases, velocity, impulses)
+        return sweeps.run(iterations, rows, _of_number(iterations, velocity.dtype), laws, biases, velocity, impulses)
 
     def with_factor(number: Array, slides: Array) -> tuple[tuple[Any, ...], ...]:
-        factor = jnp.where(slides > 0, longer(number), 1.0).astype(velocity.dtype)
+        factor = jnp.where(slides > 0, _longer(iterations, number), 1.0).astype(velocity.dtype)
         return tuple(
             (law, jnp.broadcast_to(factor, (group.bias.shape[0], 1, *factor.shape)))
             for law, group in zip(laws, rows, strict=True)
         )
 
-    update = sweeps.of_law(lambda given, bias: relaxed(given[0], bias, given[1]), lambda given: given[0])
+    update = sweeps.of_law(lambda given, bias: _relaxed(given[0], bias, given[1]), lambda given: given[0])
     return conjugate.run(iterations, update, with_factor, momentum, rows, biases, velocity, impulses)
+
+
+def _longer(iterations: int, number: Array | int) -> Array:
+    """Factor on the normal steps of a sweep."""
+    return jnp.where(number < iterations - PLAIN_SWEEPS, OVER_RELAXATION, 1.0)
+
+
+def _relaxed(law: Any, bias: Array, factor: Array) -> Any:
+    # A contact that bounces is alone for the most part, and its exact step ends at once. Longer ones leave an error
+    # of 1e-4, by which elastic boxes that bounce on their faces were measured to begin to spin.
+    return law.relaxed(jnp.where(bias[0] >= 0, factor, 1.0).astype(bias.dtype))
+
+
+def _of_number(iterations: int, dtype: Any) -> Callable[[Array | int], Update]:
+    """What each of so many sweeps does."""
+
+    def of_number(number: Array | int) -> Update:
+        factor = _longer(iterations, number).astype(dtype)
+        return sweeps.of_law(lambda law, bias: _relaxed(law, bias, factor))
+
+    return of_number
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def as_swept(iterations: int, rows: tuple[Rows, ...], found: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Impulses that sweeps from nothing have `found`, with the derivative by the biases of just these sweeps.
+
+    Of few sweeps, which end before the solution: their derivative is not that of the solution. Reverse mode stores the
+    impulses of each.
+
+    Args:
+      iterations: number of sweeps.
+      rows: as of `solve`, with all entries; their matrices and laws without derivative.
+      found: for each group (turn, row, column, world), without derivative.
+    """
+    del iterations, rows
+    return found
+
+
+@as_swept.defjvp
+def _as_swept_jvp(iterations: int, primals: tuple, tangents: tuple) -> tuple:
+    (rows, found), (d_rows, _) = primals, tangents
+    still = linear_sweeps.no_velocity(rows)
+
+    def swept(biases: tuple[Array, ...]) -> tuple[Array, ...]:
+        start = tuple(jnp.zeros_like(bias) for bias in biases)
+        laws = tuple(group.law.starting(impulse) for group, impulse in zip(rows, start, strict=True))
+        return sweeps.by_turns(iterations, _of_number(iterations, still.dtype), rows, laws, biases, still, start)[1]
+
+    biases, changes = (tuple(group.bias for group in groups) for groups in (rows, d_rows))
+    return found, jax.jvp(swept, (biases,), (changes,))[1]
 
 
 def gradient_sweeps(rows: tuple[Rows, ...], iterations: int, asked: int | None) -> int:
