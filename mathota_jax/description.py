@@ -111,7 +111,7 @@ def _features(scene: Scene) -> list[str]:
         "contacts": scene.slot_count > 0,
         "friction": scene.friction and scene.slot_count > 0,
         "restitution": scene.restitution and scene.slot_count > 0,
-        "steps split at impacts": bool(scene.options.impact_events and scene.restitution and scene.pair_groups),
+        "steps split at impacts": scene.splits_at_impacts,
         "joints": bool(scene.joints),
         "exact joints": layout(scene) is not None,
         "contacts with the joints held": takes_contacts(scene),
@@ -154,7 +154,7 @@ def _cost(scene: Scene) -> list[str]:
     cost = measured.expected_cost(setting, sizes)
     # Of rows that are solved with the joints held, the cost grows otherwise; no measured scene has any.
     held = bool(bounded_slots(scene)) or takes_contacts(scene)
-    if cost is None or held or options.impact_events or options.substeps or options.sleep or options.continuous:
+    if cost is None or held or scene.splits_at_impacts or options.substeps or options.sleep or options.continuous:
         return ["expected cost: not measured for these settings"]
     seconds, factor = cost
     if setting == "pgs":

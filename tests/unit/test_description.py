@@ -135,6 +135,7 @@ def test_expected_cost():
     assert 0 < ten <= twenty < 1e3
     assert cost(solver="converged") > ten
     assert cost(solver="soft_step", substeps=8) is None and cost(sleep=True) is None
+    assert cost(impact_events=4) == ten, "nothing bounces: the option is absent"
 
 
 def test_a_larger_scene_is_expected_to_cost_more():
