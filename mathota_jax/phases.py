@@ -105,14 +105,14 @@ class SolvedRows(NamedTuple):
       velocity: (component, block, world).
       impulses: of all groups (turn, row, column, world).
       failed: 1 for each world (world,) that was not solved; None from "pgs".
-      held: impulses of mechanisms where there is nothing else.
+      held: solution for mechanisms where there is nothing else.
       uncut: impulses with the full rebounds; None where none is ever cut.
     """
 
     velocity: Array
     impulses: tuple[Array, ...]
     failed: Array | None = None
-    held: mechanism_links.Impulses | None = None
+    held: mechanism.Solution | None = None
     uncut: tuple[Array, ...] | None = None
 
 
@@ -124,7 +124,7 @@ def solve_rows(
     start: tuple[Array, ...],
     change: Array | None = None,
     known: bool = False,
-    held: mechanism_links.Impulses | None = None,
+    held: mechanism.Solution | None = None,
 ) -> SolvedRows:
     """Phase 5: velocity constraints.
 
@@ -348,16 +348,16 @@ def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.
 
 
 def close_joints(
-    model: Model, bodies: Bodies, moved: Bodies, known: mechanism_links.Impulses | None = None
-) -> tuple[Bodies, mechanism_links.Impulses]:
+    model: Model, bodies: Bodies, moved: Bodies, known: mechanism.Solution | None = None
+) -> tuple[Bodies, mechanism.Solution]:
     """Mechanisms at the end of the step: their joints closed, and velocities along which they stay closed.
 
-    The second is a projection in the metric of the kinetic energy, and so never adds any. Also the impulses of all rounds,
+    The second is a projection in the metric of the kinetic energy, and so never adds any. Also the solutions of all rounds,
     which may be `known`.
     """
     scene = model.scene
 
-    def close(moved: Bodies, of_round: tuple) -> tuple[Bodies, mechanism_links.Impulses]:
+    def close(moved: Bodies, of_round: tuple) -> tuple[Bodies, mechanism.Solution]:
         is_last, known = of_round
         inertia = moving_inertia(scene, model, moved.orientation)
         joints = joint_rows.joint_rows(model, merge(scene, bodies, moved))
@@ -374,15 +374,15 @@ def close_joints(
             errors if yielding is None else mechanism_links.of_slots(links, loops.correctable(model, joints.error))
         )
         wanted = jax.tree.map(lambda rate, error: -jnp.where(is_last, rate, error), excess, closing)
-        impulses = mechanism.solve(links, wanted, known)
-        change = mechanism_links.push(links, impulses)
+        found = mechanism.solve(links, wanted, known)
+        change = found.change(links)
         linear, angular = unpack_blocks(jnp.where(is_last, velocity + change, velocity))
         assert angular is not None
         moved = moved._replace(velocity=linear, angular_velocity=angular)
         if not rounds:
-            return moved, impulses
+            return moved, found
         shift = jnp.where(is_last, mechanism.closing_shift(links, errors), mechanism_correction.bounded(change))
-        return displace(moved, inertia, shift), impulses
+        return displace(moved, inertia, shift), found
 
     rounds = mechanism.rounds(scene)
     worlds = max(leaf.shape[-1] for leaf in jax.tree.leaves((moved, model, known)))
@@ -390,12 +390,12 @@ def close_joints(
     if known is not None:
         # Nothing is left to be found that it would be cheaper to store than to compute again.
         close = jax.checkpoint(close, prevent_cse=False)
-    closed, impulses = lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
+    closed, solutions = lax.scan(close, moved, (jnp.arange(rounds + 1) == rounds, known))
     found = layout(scene)
     if found is not None and found.closings:
         inertia = moving_inertia(scene, model, closed.orientation)
         closed = mechanism_correction.without_gain(found, inertia, gravity(model), moved, closed)
-    return closed, impulses
+    return closed, solutions
 
 
 def stop_at_impacts(

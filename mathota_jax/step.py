@@ -215,7 +215,7 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     if layout(scene) is not None:
         moved, closed = close_joints(model, bodies, moved, closed)
     found = forces(model, problem, impulses)
-    closing = None if closed is None else closing_force(model, closed)
+    closing = None if closed is None else closing_force(model, closed.impulses)
     if closing is not None:
         found["joint_force"] = found["joint_force"] + closing
     new = new_state(scene, state, moved, found, failed)

@@ -30,11 +30,12 @@ from mathota_jax.constraints.mechanism_links import (
     Links,
     along_directions,
     column,
+    forces_on_links,
     of_slots,
     only_held,
     pack,
-    push,
     rates,
+    rates_of_links,
     shift_of_turn,
     to_blocks,
     to_slots,
@@ -59,16 +60,34 @@ LOOP_ROUNDS = 2
 """The same where there are loops. A bridge as long as its span opens by half as much with two as with one."""
 
 
+class Solution(NamedTuple):
+    """Impulses, and what they change.
+
+    Attributes:
+      impulses: of the rows.
+      motion: velocities of the links (link, 3, world). They do not come from the impulses: on a light link between heavy
+        ones these all but cancel each other, and what their round-off made of a carriage of 1 g under 12 kg grew from step
+        to step.
+    """
+
+    impulses: Impulses
+    motion: tree.Pair
+
+    def change(self, links: Links) -> Array:
+        """Change of the velocities (component, block, world)."""
+        return to_blocks(links.layout, pack_blocks(*unpack(self.motion)))
+
+
 class Solutions(NamedTuple):
     """What `solve` finds in a step.
 
     Attributes:
-      held: impulses of the step where there are mechanisms alone, else None.
-      closed: those that close the joints at its end, of all rounds, (round, link, world).
+      held: of the step where there are mechanisms alone, else None.
+      closed: what closes the joints at its end, of all rounds, (round, link, ...).
     """
 
-    held: Impulses | None
-    closed: Impulses
+    held: Solution | None
+    closed: Solution
 
 
 def rounds(scene: Scene) -> int:
@@ -80,78 +99,98 @@ def rounds(scene: Scene) -> int:
     return LOOP_ROUNDS if found.closings else ROUNDS
 
 
-def solve(links: Links, wanted: Impulses, known: Impulses | None = None) -> Impulses:
+def solve(links: Links, wanted: Impulses, known: Solution | None = None) -> Solution:
     """Impulses that change the rates of the rows by `wanted`; differentiable in both modes.
 
-    Where they are `known`, derivatives are computed without finding them again.
+    Where the solution is `known`, derivatives are computed without finding it again.
     """
-    worlds = max(leaf.shape[-1] for leaf in (*wanted, *(known or ()), links.factors.offset, links.offset.x))
-    wanted, known = in_every_world((wanted, known), worlds)
-    if known is not None:
-        leaves, tree = jax.tree.flatten((links, wanted, known))
-        return tuple(_known_solution_p.bind(*leaves, tree=tree))
-
-    def product(impulses: Impulses) -> Impulses:
-        changes = _changes(links, only_held(links, impulses))
-        of_trees = (
-            jnp.where(flags[:, None], change, impulse)
-            for flags, change, impulse in zip(links.layout.held, changes[:6], impulses[:6], strict=True)
-        )
-        return *of_trees, *changes[6:]
-
-    return lax.custom_linear_solve(product, wanted, lambda _, right: _impulses(links, right), symmetric=True)
+    leaves = jax.tree.leaves((wanted, known, links.factors.offset, links.offset.x))
+    wanted, known = in_every_world((wanted, known), max(leaf.shape[-1] for leaf in leaves))
+    if known is None:
+        known = _solution(*lax.stop_gradient((links, wanted)))
+    return _as_found(links, wanted, None, known)
 
 
-def _changes(links: Links, impulses: Impulses) -> Impulses:
-    """Changes of the rates by impulses, and how far the rows that close loops give way to them."""
-    changes = rates(links, push(links, impulses))
-    if links.loops is None:
-        return changes
-    return *changes[:6], changes[6] + links.loops.compliance * impulses[6]
+def _as_found(links: Links, wanted: Impulses, against: tree.Pair | None, found: Solution) -> Solution:
+    """What was found, with the derivative of the solution; arguments as of `_solution`."""
+    leaves, structure = jax.tree.flatten((links, wanted, against, lax.stop_gradient(found)))
+    return jax.tree.unflatten(jax.tree.structure(found), _solution_p.bind(*leaves, structure=structure))
 
 
-def _known_solution(*leaves: Array, tree: Any) -> list[Array]:
-    return list(jax.tree.unflatten(tree, leaves)[2])
+def _linear_solve(links: Links, right: Solution) -> Solution:
+    """Solution x of ``_product(links, x) = right``; differentiable in both modes."""
+
+    def found(_: Any, right: Solution) -> Solution:
+        return _solution(links, *right)
+
+    return lax.custom_linear_solve(lambda x: _product(links, x), right, found, symmetric=True)
 
 
-def _known_solution_jvp(
-    primals: Sequence[Array], tangents: Sequence[Any], *, tree: Any
+def _product(links: Links, solution: Solution) -> Solution:
+    """The symmetric system ``J v = wanted`` (and rows that close loops give way), ``J^T impulses - M v = 0``.
+
+    In the place of impulses where nothing is held: themselves.
+    """
+    linear, angular = unpack(solution.motion)
+    changes = rates_of_links(links, linear, angular)
+    of_trees = (
+        jnp.where(flags[:, None], change, impulse)
+        for flags, change, impulse in zip(links.layout.held, changes[:6], solution.impulses[:6], strict=True)
+    )
+    closing = changes[6:]
+    if links.loops is not None:
+        closing = (changes[6] + links.loops.compliance * solution.impulses[6],)
+    force, torque = forces_on_links(links, only_held(links, solution.impulses))
+    left = pack(force - linear * (1.0 / links.inertia.inverse_mass), torque - links.inertia.apply(angular))
+    return Solution((*of_trees, *closing), left)
+
+
+def _known(*leaves: Array, structure: Any) -> list[Array]:
+    return jax.tree.leaves(jax.tree.unflatten(structure, leaves)[3])
+
+
+def _solution_jvp(
+    primals: Sequence[Array], tangents: Sequence[Any], *, structure: Any
 ) -> tuple[list[Array], list[Array]]:
-    links = jax.tree.unflatten(tree, primals)[0]
-    d_links, d_wanted, _ = jax.tree.unflatten(tree, [ad.instantiate_zeros(tangent) for tangent in tangents])
+    links, _, _, known = jax.tree.unflatten(structure, primals)
+    instantiated = [ad.instantiate_zeros(tangent) for tangent in tangents]
+    d_links, d_wanted, d_against, _ = jax.tree.unflatten(structure, instantiated)
     # Not `known` itself, which is constant: this depends on the links and wanted rates when it is differentiated again.
-    found = tuple(_known_solution_p.bind(*primals, tree=tree))
-    changes = jax.jvp(lambda links: _changes(links, found), (links,), (d_links,))[1]
-    right = only_held(links, jax.tree.map(jnp.subtract, d_wanted, changes))
-    return list(found), list(solve(links, right))
+    leaves = tuple(_solution_p.bind(*primals, structure=structure))
+    found = jax.tree.unflatten(jax.tree.structure(known), leaves)
+    changes = jax.jvp(lambda links: _product(links, found), (links,), (d_links,))[1]
+    rates, momentum = jax.tree.map(jnp.negative, changes)
+    rates = only_held(links, jax.tree.map(jnp.add, d_wanted, rates))
+    if d_against is not None:
+        momentum = jax.tree.map(jnp.add, d_against, momentum)
+    return list(leaves), jax.tree.leaves(_linear_solve(links, Solution(rates, momentum)))
 
 
 # A primitive: a `custom_jvp` loses its rule where JAX splits a program into what is known and what is linear, and with it
 # the second derivatives.
-_known_solution_p = Primitive("known_solution")
-_known_solution_p.multiple_results = True
-_known_solution_p.def_impl(_known_solution)
-_known_solution_p.def_abstract_eval(
-    lambda *leaves, tree: [ShapedArray(x.shape, x.dtype) for x in _known_solution(*leaves, tree=tree)]
+_solution_p = Primitive("solution")
+_solution_p.multiple_results = True
+_solution_p.def_impl(_known)
+_solution_p.def_abstract_eval(
+    lambda *leaves, structure: [ShapedArray(x.shape, x.dtype) for x in _known(*leaves, structure=structure)]
 )
-ad.primitive_jvps[_known_solution_p] = _known_solution_jvp
-mlir.register_lowering(_known_solution_p, mlir.lower_fun(_known_solution, multiple_results=True))
+ad.primitive_jvps[_solution_p] = _solution_jvp
+mlir.register_lowering(_solution_p, mlir.lower_fun(_known, multiple_results=True))
 
 
-def _impulses(links: Links, wanted: Impulses) -> Impulses:
-    """`solve` without derivatives."""
-    found = _of_trees(links, wanted[:6])
+def _solution(links: Links, wanted: Impulses, against: tree.Pair | None = None) -> Solution:
+    """Solution of `_product`, without derivatives: joints part as `wanted` against forces on the links."""
+    found = _of_trees(links, wanted[:6], against)
     if links.loops is None:
         return found
-    loops, links = lax.stop_gradient((links.loops, links))
-    without = rates(links, push(links, (*found, jnp.zeros_like(wanted[6]))))
-    closing = mechanism_loops.impulses(loops, compute_once(wanted[6] - without[6], wanted[6]))
-    alone = rates(links, push(links, (*map(jnp.zeros_like, found), closing)))
-    found = _of_trees(links, tuple(map(jnp.subtract, wanted[:6], alone[:6])))
-    return *found, closing
+    loops = lax.stop_gradient(links.loops)
+    left = wanted[6] - mechanism_loops.rates(loops, *unpack(found.motion))
+    closing = mechanism_loops.impulses(loops, compute_once(left, left))
+    impulses, motion = _of_trees(links, wanted[:6], _against_closing(links, closing, against))
+    return Solution((*impulses, closing), motion)
 
 
-def _of_trees(links: Links, wanted: Impulses) -> Impulses:
+def _of_trees(links: Links, wanted: Impulses, against: tree.Pair | None) -> Solution:
     """The same where nothing closes loops."""
     translations, duals = lax.stop_gradient((links.translations, links.duals))
     # Each goes into all components of a motion.
@@ -159,15 +198,26 @@ def _of_trees(links: Links, wanted: Impulses) -> Impulses:
     turn = compute_once(along_directions(duals[1], wanted[3:]), wanted[0])
     shift = along_directions(duals[0], wanted[:3]) + shift_of_turn(translations, duals[0], turn)
     shift = compute_once(shift, wanted[0])
-    force = tree.force_for(links.layout.tree, links.factors, pack(shift, turn))
+    force, motion = tree.force_for(links.layout.tree, links.factors, pack(shift, turn), against)
+    return Solution(*compute_once((_of_rows(links, force), motion), wanted[0]))
+
+
+def _of_rows(links: Links, force: tree.Pair) -> Impulses:
+    """Impulses of the rows of trees that are these forces of the joints on the links."""
     along, about = unpack(force)
-    linear = [dot(dual, along) for dual in duals[0]]
-    for side, impulse in zip(translations, linear, strict=True):
+    linear = [dot(dual, along) for dual in links.duals[0]]
+    for side, impulse in zip(links.translations, linear, strict=True):
         about = about - side.angular * impulse
-    return compute_once(only_held(links, [*linear, *(dot(dual, about) for dual in duals[1])]), wanted[0])
+    return only_held(links, [*linear, *(dot(dual, about) for dual in links.duals[1])])
 
 
-@jax.custom_jvp
+def _against_closing(links: Links, closing: Array, against: tree.Pair | None) -> tree.Pair:
+    """What the joints of trees work against where others close loops with impulses (row, world)."""
+    assert links.loops is not None
+    pulls = pack(*(-part for part in mechanism_loops.forces(links.loops, closing)))
+    return pulls if against is None else jax.tree.map(jnp.add, against, pulls)
+
+
 def respond(links: Links, impulse: Array) -> Array:
     """Velocities (component, block, world) under impulses on the bodies, likewise, with the joints held.
 
@@ -175,26 +225,21 @@ def respond(links: Links, impulse: Array) -> Array:
     """
     of_links = take(unpack_blocks(impulse), links.layout.blocks)
     worlds = max(impulse.shape[-1], links.factors.offset.shape[-1])
-    motion = tree.respond(links.layout.tree, links.factors, in_every_world(pack(*of_links), worlds))
+    against = in_every_world(pack(*(-part for part in of_links)), worlds)
+    nothing = (jnp.zeros((len(links.layout.links), worlds), impulse.dtype),) * 6
     if links.loops is not None:
-        motion = mechanism_loops.respond_to(links.loops, motion)
-    return to_blocks(links.layout, pack_blocks(*unpack(motion)))
+        nothing = (*nothing, jnp.zeros((links.loops.compliance.shape[0], worlds), impulse.dtype))
+    return _as_found(links, nothing, against, _response(*lax.stop_gradient((links, against)))).change(links)
 
 
-@respond.defjvp
-def _respond_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    found = respond(*primals)
-
-    def again(links: Links, impulse: Array) -> Array:
-        """The same from the bodies alone, whose motion along the rows is taken back."""
-        force, torque = take(unpack_blocks(impulse), links.layout.blocks)
-        alone = pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque))
-        excess = to_blocks(links.layout, alone) - found
-        # Of what is found the rates are 0, but not once the rows turn.
-        wanted = jax.tree.map(lambda *parts: -sum(parts), rates(links, excess), rates(links, found))
-        return excess + push(links, solve(links, wanted))
-
-    return found, jax.jvp(again, primals, tangents)[1]
+def _response(links: Links, against: tree.Pair) -> Solution:
+    """`_solution` where the joints hold."""
+    motion, closing = tree.respond(links.layout.tree, links.factors, jax.tree.map(jnp.negative, against)), ()
+    if links.loops is not None:
+        motion, found = mechanism_loops.respond_to(links.loops, motion)
+        closing, against = (found,), _against_closing(links, found, against)
+    force = tree.force_of(links.layout.tree, links.factors, motion, against)
+    return Solution((*_of_rows(links, force), *closing), motion)
 
 
 def sum_by_mechanism(found: Layout, values: Array) -> Array:
@@ -235,8 +280,8 @@ def hold(
     joint_rows: Sequence[Rows],
     velocity: Array,
     impulses: tuple[Array, ...],
-    known: Impulses | None = None,
-) -> tuple[Array, tuple[Array, ...], Impulses]:
+    known: Solution | None = None,
+) -> tuple[Array, tuple[Array, ...], Solution]:
     """Velocity and impulses with which the rows of mechanisms hold exactly.
 
     Args:
@@ -244,19 +289,19 @@ def hold(
       joint_rows: all joint rows.
       velocity: (component, block, world) with the impulses so far.
       impulses: of all groups, those of the joints first.
-      known: change of the impulses of the links; None if it is not known yet.
+      known: solution for the links; None if it is not known yet.
 
     Returns:
-      Velocity, impulses, and the change.
+      Velocity, impulses, and the solution.
     """
     tables = [group.table for group in joint_rows]
     slot_count = sum(int((table.order != EMPTY).sum()) for table in tables)
     bias = collect(tables, [group.bias[:, 0] for group in joint_rows], slot_count)
     wanted = jax.tree.map(lambda rate, bias: -(rate + bias), rates(links, velocity), of_slots(links, bias))
-    change = solve(links, wanted, known)
-    of_all = to_slots(links.layout, change, slot_count)
+    found = solve(links, wanted, known)
+    of_all = to_slots(links.layout, found.impulses, slot_count)
     new = [
         impulse + pack_scalars(table, [select(table, of_all)], of_all.shape[-1])
         for table, impulse in zip(tables, impulses[: len(tables)], strict=True)
     ]
-    return velocity + push(links, change), (*new, *impulses[len(tables) :]), change
+    return velocity + found.change(links), (*new, *impulses[len(tables) :]), found

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from mathota_jax.bodies import Inertia, pack_blocks, unpack_blocks
+from mathota_jax.bodies import Inertia, unpack_blocks
 from mathota_jax.constraints import mechanism_loops
 from mathota_jax.constraints.assembly import Side
 from mathota_jax.constraints.joint_rows import JointRows
@@ -190,7 +190,11 @@ def unpack(pair: tree.Pair) -> tuple[Vec3, Vec3]:
 
 def rates(links: Links, velocity: Array) -> Impulses:
     """Rates along all rows of the velocities (component, block, world)."""
-    linear, angular = take(unpack_blocks(velocity), links.layout.blocks)
+    return rates_of_links(links, *take(unpack_blocks(velocity), links.layout.blocks))
+
+
+def rates_of_links(links: Links, linear: Vec3, angular: Vec3) -> Impulses:
+    """The same of the velocities (link, world)."""
     closing = () if links.loops is None else (mechanism_loops.rates(links.loops, linear, angular),)
     parent_linear, parent_angular = (_of_parents(links.layout, part) for part in (linear, angular))
     linear = linear - parent_linear - cross(parent_angular, links.offset)
@@ -206,8 +210,8 @@ def _stored(links: Links, linear: Vec3, angular: Vec3) -> tuple[Vec3, Vec3]:
     return Vec3(*map(store, linear, links.offset)), Vec3(*map(store, angular, links.rotations[0]))
 
 
-def push(links: Links, impulses: Impulses) -> Array:
-    """Change of the velocities (component, block, world) by impulses."""
+def forces_on_links(links: Links, impulses: Impulses) -> tuple[Vec3, Vec3]:
+    """Sums (link, world) of impulses, and of their moments about the centres of mass."""
     force = torque = links.offset * 0.0
     for side, impulse in zip(links.translations, impulses[:3], strict=True):
         assert side.angular is not None
@@ -217,9 +221,9 @@ def push(links: Links, impulses: Impulses) -> Array:
     force, torque = store_cotangents(_stored(links, force, torque))
     carried = torque + cross(links.offset, force)
     force, torque = force - to_parents(links.layout, force), torque - to_parents(links.layout, carried)
-    if links.loops is not None:
-        force, torque = map(operator.add, (force, torque), mechanism_loops.forces(links.loops, impulses[6]))
-    return to_blocks(links.layout, pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque)))
+    if links.loops is None:
+        return force, torque
+    return tuple(map(operator.add, (force, torque), mechanism_loops.forces(links.loops, impulses[6])))  # type: ignore[return-value]
 
 
 def along_directions(directions: tuple[Vec3, ...], values: Impulses) -> Vec3:

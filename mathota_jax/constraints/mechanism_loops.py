@@ -151,11 +151,11 @@ def impulses(loops: Loops, rates: Array) -> Array:
     return found + add_scaled(loops.inverse, rates - add_scaled(loops.matrix, found))
 
 
-def respond_to(loops: Loops, motion: tree.Pair) -> tree.Pair:
-    """Motions (link, 3, world) of trees of which the loops hold as well."""
+def respond_to(loops: Loops, motion: tree.Pair) -> tuple[tree.Pair, Array]:
+    """Motions (link, 3, world) of trees of which the loops hold as well, and the impulses (row, world) of these."""
     wanted = -rates(loops, *(Vec3(*unstack(part, 1)) for part in motion))
     found = impulses(loops, compute_once(wanted, wanted))
-    return jax.tree.map(lambda part, response: part + add_scaled(response, found), motion, loops.responses)
+    return jax.tree.map(lambda part, response: part + add_scaled(response, found), motion, loops.responses), found
 
 
 def share_gaps(found: Layout, gaps: Vec3) -> Vec3:

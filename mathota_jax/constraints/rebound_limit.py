@@ -71,7 +71,7 @@ def with_held_falling(links: Links, contacts: Sequence[ContactRows], gravity: Ve
     falling = pack_blocks(gravity, gravity.map(jnp.zeros_like))
     falling = jnp.broadcast_to(falling, (len(falling), links.layout.block_count, falling.shape[-1]))
     bearing = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism_links.rates(links, falling)))
-    held = falling + mechanism_links.push(links, bearing)
+    held = falling + bearing.change(links)
     return [contact._replace(falling=row_velocity(contact.rows, held) * contact.lever) for contact in contacts]
 
 

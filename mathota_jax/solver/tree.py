@@ -113,19 +113,34 @@ def factorize(tree: Tree, masses: Masses, offset: Array, columns: Pair) -> Facto
     return Factors(masses, matrix, columns, forces, compliance, roots)
 
 
-def force_for(tree: Tree, factors: Factors, jump: Pair) -> Pair:
-    """Forces on the links, from their joints, that part them as wanted.
+def force_for(tree: Tree, factors: Factors, jump: Pair, against: Pair | None = None) -> tuple[Pair, Pair]:
+    """Forces on the links, from their joints, that part them as wanted, and the motions that these give.
+
+    The motions do not come from the forces, which all but cancel each other on a light link between heavy ones.
 
     Args:
       tree, factors: structure and what `factorize` gives.
       jump: motion of each link relative to its parent, but for any sum of its columns.
+      against: forces on the links that the joints have to work against; None for none.
     """
-    jump = in_every_world(jump, max(jump[0].shape[-1], factors.offset.shape[-1]))
+    worlds = max(part.shape[-1] for part in jax.tree.leaves((jump, against, factors.offset)))
+    jump, against = in_every_world((jump, against), worlds)
     # Any motion that has the jumps; then the one of least energy among those that differ by columns.
     wanted = follow(tree, factors.offset, jump)
-    released = respond(tree, factors, jax.tree.map(jnp.negative, _momentum(factors.masses, wanted)))
-    momentum = _momentum(factors.masses, _add_scaled(wanted, released, 1.0))
-    return _inward(tree, lambda force, across: (_onto_parent(force, across), force), momentum, factors.offset)
+    released = respond(tree, factors, jax.tree.map(jnp.negative, _needed(factors, wanted, against)))
+    motion = _add_scaled(wanted, released, 1.0)
+    return force_of(tree, factors, motion, against), motion
+
+
+def force_of(tree: Tree, factors: Factors, motion: Pair, against: Pair | None = None) -> Pair:
+    """Forces on the links, from their joints, that give these motions; `against` as in `force_for`."""
+    needed = _needed(factors, motion, against)
+    return _inward(tree, lambda force, across: (_onto_parent(force, across), force), needed, factors.offset)
+
+
+def _needed(factors: Factors, motion: Pair, against: Pair | None) -> Pair:
+    momentum = _momentum(factors.masses, motion)
+    return momentum if against is None else _add_scaled(momentum, against, 1.0)
 
 
 def respond(tree: Tree, factors: Factors, impulse: Pair) -> Pair:

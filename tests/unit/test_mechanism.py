@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import BallAndSocket, Box, Distance, Fixed, Hinge, SceneBuilder, Slider, Sphere
-from mathota_jax.bodies import moving, moving_inertia, unpack
+from mathota_jax.bodies import moving, moving_inertia, pack_blocks, unpack
 from mathota_jax.constraints import mechanism, mechanism_coordinates, mechanism_links
 from mathota_jax.constraints.joint_rows import joint_rows
 from mathota_jax.constraints.mechanism_layout import covers, layout
@@ -67,9 +67,13 @@ def test_impulses_are_those_of_the_dense_matrix(float64, case, gate):
 
     rows, count = joints.error.shape[0], len(scene.dynamic_bodies)
     wanted = generator.normal(size=(rows, 2))
-    impulses = mechanism.solve(links, mechanism_links.of_slots(links, jnp.asarray(wanted)))
-    change = np.asarray(mechanism_links.push(links, impulses))
-    solved = np.asarray(mechanism_links.to_slots(links.layout, impulses, rows))
+    solution = mechanism.solve(links, mechanism_links.of_slots(links, jnp.asarray(wanted)))
+    change = np.asarray(solution.change(links))
+    force, torque = mechanism_links.forces_on_links(links, solution.impulses)
+    by_impulses = pack_blocks(force * links.inertia.inverse_mass, links.inertia.solve(torque))
+    by_impulses = mechanism_links.to_blocks(links.layout, by_impulses)
+    gate("velocity by the impulses", change - by_impulses, 1e-9 * np.abs(change).max())
+    solved = np.asarray(mechanism_links.to_slots(links.layout, solution.impulses, rows))
     ends = {}
     for link in found.links:
         for slot in (*link.slots[0], *link.slots[1]):
@@ -161,10 +165,10 @@ def test_worlds_that_differ_by_masses_alone(float64, gate):
     models = dataclasses.replace(model, mass=model.mass * jnp.array([1.0, 3.0]))
     links = links_at(models, state)
     wanted = tuple(jnp.ones((len(links.layout.links), 1)) for _ in range(6))
-    found = mechanism.solve(links, mechanism_links.only_held(links, wanted))
+    found = mechanism.solve(links, mechanism_links.only_held(links, wanted)).impulses
     for world in range(2):
         alone = links_at(dataclasses.replace(model, mass=models.mass[:, world : world + 1]), state)
-        truth = mechanism.solve(alone, mechanism_links.only_held(alone, wanted))
+        truth = mechanism.solve(alone, mechanism_links.only_held(alone, wanted)).impulses
         gate("impulses", [np.abs(a[:, world] - b[:, 0]).max() for a, b in zip(found, truth, strict=True)], 1e-12)
 
 

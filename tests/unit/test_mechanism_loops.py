@@ -68,8 +68,8 @@ def test_velocities_are_projected(float64, case, gate):
     links = mechanism_links.links(scene, joints, blocks.position, inertia)
     count, rows = len(scene.dynamic_bodies), joints.error.shape[0]
     velocity = jnp.asarray(np.random.default_rng(0).normal(size=(6, count, 1)))
-    impulses = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism_links.rates(links, velocity)))
-    left = velocity + mechanism_links.push(links, impulses)
+    solution = mechanism.solve(links, jax.tree.map(jnp.negative, mechanism_links.rates(links, velocity)))
+    left = velocity + solution.change(links)
 
     # All boxes are upright, so that their principal axes are those of the world.
     masses = np.concatenate(
