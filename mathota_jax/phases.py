@@ -320,12 +320,16 @@ def correct_positions(
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
     worlds = max(group.bias.shape[-1] for group in rows)
     zero = jnp.zeros((*packed.shape[:-1], worlds), packed.dtype)
+    iterations = options.position_iterations
     if joint_layout.solves_together(scene):
         correction = converged.solve(tuple(rows), zero, start)[0]
-    else:
-        iterations = options.position_iterations
+    elif problem.joints is None:
         gradient = _gradient_iterations(scene, tuple(rows), iterations)
         correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start, zero)
+    else:
+        # Joints that pull on each other are not where they should be after so few sweeps.
+        found = pgs.solve(iterations, 1, *lax.stop_gradient((tuple(rows), zero, start, zero)))[1]
+        correction = add_impulses(tuple(rows), zero, pgs.as_swept(iterations, tuple(rows), zero, found))
     return displace(moved, inertia, correction if back is None else correction + back)
 
 
@@ -344,7 +348,7 @@ def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.
     # What the matrix changes at these impulses: it has no derivative of its own.
     left = take(reduced.rates(change(found)), chosen)
     rows = mechanism_contacts.with_errors(rows, left - lax.stop_gradient(left))
-    return change(pgs.as_swept(iterations, rows, found))
+    return change(pgs.as_swept(iterations, rows, still, found))
 
 
 def close_joints(

@@ -229,14 +229,9 @@ def with_rates(groups: Sequence[Rows], delassus: Delassus, rates: Array) -> tupl
 
 
 def with_errors(groups: Sequence[Rows], errors: Array) -> tuple[Rows, ...]:
-    """The groups with the errors (row, world) added to their biases, in the order of their rows; for derivatives.
-
-    With all entries of their matrices, of which `Picked` has those for the sweeps alone.
-    """
+    """The groups with the errors (row, world) added to their biases, in the order of their rows."""
     parts = zip(groups, by_group(groups, errors), strict=True)
-    return tuple(
-        dataclasses.replace(group, matrix=group.matrix.dense(), bias=group.bias + error) for group, error in parts
-    )
+    return tuple(dataclasses.replace(group, bias=group.bias + error) for group, error in parts)
 
 
 def _fixed_tables(scene: Scene) -> tuple[Table, ...]:

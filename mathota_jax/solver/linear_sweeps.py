@@ -102,7 +102,7 @@ def solve(
     (M^-1 J^T)^T (J^T H^T z) + ...``, has the same form.
     """
     everywhere = visiting_all_turns(rows)  # the product is transposed too
-    nothing = no_velocity(rows)
+    nothing = _no_velocity(rows)
 
     product = functools.partial(left_unanswered, everywhere, slopes, nothing)
 
@@ -182,7 +182,6 @@ def _accelerate(rows: tuple[Rows, ...]) -> bool:
     return all(isinstance(group.law, Cone) for group in rows)
 
 
-def no_velocity(rows: tuple[Rows, ...]) -> Array:
-    """(component, block, world) 0 for what rows act on, of which the matrices have all entries."""
+def _no_velocity(rows: tuple[Rows, ...]) -> Array:
     response = rows[0].response[0]
     return jnp.zeros((response.shape[2], rows[0].table.block_count, response.shape[4]), response.dtype)

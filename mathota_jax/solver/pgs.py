@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.custom_derivatives import SymbolicZero
 
 from mathota_jax.solver import conjugate, implicit, linear_sweeps, sweeps
 from mathota_jax.solver.laws import Cone, Push
@@ -108,33 +109,41 @@ def _of_number(iterations: int, dtype: Any) -> Callable[[Array | int], Update]:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def as_swept(iterations: int, rows: tuple[Rows, ...], found: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Impulses that sweeps from nothing have `found`, with the derivative by the biases of just these sweeps.
+def as_swept(iterations: int, rows: tuple[Rows, ...], still: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Impulses that sweeps from nothing have `found`, with the derivative of just these sweeps.
 
     Of few sweeps, which end before the solution: their derivative is not that of the solution. Reverse mode stores the
     impulses of each.
 
     Args:
       iterations: number of sweeps.
-      rows: as of `solve`, with all entries; their matrices and laws without derivative.
+      rows: as of `solve`.
+      still: the velocity (component, block, world) from which they were found, 0.
       found: for each group (turn, row, column, world), without derivative.
     """
-    del iterations, rows
+    del iterations, rows, still
     return found
 
 
-@as_swept.defjvp
 def _as_swept_jvp(iterations: int, primals: tuple, tangents: tuple) -> tuple:
-    (rows, found), (d_rows, _) = primals, tangents
-    still = linear_sweeps.no_velocity(rows)
+    rows, still, found = primals
+    leaves, structure = jax.tree.flatten(rows)
+    changes = jax.tree.leaves(tangents[0])
+    moving = [k for k, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
 
-    def swept(biases: tuple[Array, ...]) -> tuple[Array, ...]:
-        start = tuple(jnp.zeros_like(bias) for bias in biases)
-        laws = tuple(group.law.starting(impulse) for group, impulse in zip(rows, start, strict=True))
-        return sweeps.by_turns(iterations, _of_number(iterations, still.dtype), rows, laws, biases, still, start)[1]
+    def swept(of_moving: list[Array]) -> tuple[Array, ...]:
+        new = dict(zip(moving, of_moving, strict=True))
+        given = jax.tree.unflatten(structure, [new.get(k, leaf) for k, leaf in enumerate(leaves)])
+        start = tuple(jnp.zeros_like(group.bias) for group in given)
+        laws = tuple(group.law.starting(impulse) for group, impulse in zip(given, start, strict=True))
+        biases = tuple(group.bias for group in given)
+        return sweeps.by_turns(iterations, _of_number(iterations, still.dtype), given, laws, biases, still, start)[1]
 
-    biases, changes = (tuple(group.bias for group in groups) for groups in (rows, d_rows))
-    return found, jax.jvp(swept, (biases,), (changes,))[1]
+    old, d_old = ([values[k] for k in moving] for values in (leaves, changes))
+    return found, jax.jvp(swept, (old,), (d_old,))[1]
+
+
+as_swept.defjvp(_as_swept_jvp, symbolic_zeros=True)
 
 
 def gradient_sweeps(rows: tuple[Rows, ...], iterations: int, asked: int | None) -> int:
