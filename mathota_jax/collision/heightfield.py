@@ -62,6 +62,12 @@ MERGE = 1e-3
 """Contacts closer than this share of the body's size, normals included, are one."""
 HEIGHT_WEIGHT = 10.0
 """A contact higher than the deepest one must widen the base by this many times the height (see `plane_polyhedron`)."""
+NEAR, TOUCHING = 0.004, 0.01
+"""What is at most this share of the body's size above the deepest contact comes before all that is higher, where that
+contact is closer to the ground than the second share. A place that a corner some mm above the ground takes from a point that
+bears the body lets it fall for a step: of plates of 0.3 m on bumps of 1 cm 50 of 96 never came to rest without this, 5 do
+not with it. A body that is still falling needs what spans it: without the second share the deepest overlap of boxes that
+land at 2 m/s grew from 13 to 35 mm."""
 WALL_FEATURES = 1024
 """More than the features of a plane with any shape."""
 ABSENT = 1e6
@@ -340,8 +346,9 @@ def _joined(parts: list[Candidates]) -> Candidates:
 def _reduced(candidates: Candidates, size: Array, base_count: int) -> tuple[Array, ...]:
     """Settled numbers of up to four candidates, -1 for none; the deepest first.
 
-    The farthest from it, the farthest from the line through both and the one that adds most to the triangle follow
-    (guide 7.2). A different normal counts as a distance: in a valley two contacts of one point are two.
+    The farthest from it, the farthest from the line through both and the one that adds most to the triangle follow (guide
+    7.2); of a body that touches the ground, those first that are as near. A different normal counts as a distance: in a
+    valley two contacts of one point are two.
     """
     ground, up, separation, _, valid = lax.stop_gradient(candidates)
     ground, up, separation = compute_once((ground, up, separation), separation)
@@ -355,7 +362,11 @@ def _reduced(candidates: Candidates, size: Array, base_count: int) -> tuple[Arra
     best, first = best_candidate(jnp.where(valid, score, lowest))
     first = jnp.where(best > lowest, first, -1)
     ground0, up0, depth0 = pick((ground, up, separation), first)
-    penalty = HEIGHT_WEIGHT * jnp.maximum(separation - depth0, 0.0) - LEAN_SHARE * lean
+    rise = jnp.maximum(separation - depth0, 0.0)
+    touches = 1.0 - jnp.clip(depth0 / (TOUCHING * size), 0.0, 1.0)
+    # No base is wider than two sizes.
+    later = 2.0 * size * touches * jnp.minimum(rise / (NEAR * size), 1.0)
+    penalty = HEIGHT_WEIGHT * rise + later - LEAN_SHARE * lean
 
     def winner(widening: Array, usable: Array) -> Array:
         distinct = (widening > MERGE * size) & usable & valid
