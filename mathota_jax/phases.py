@@ -328,7 +328,7 @@ def correct_positions(
         correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start, zero)
     else:
         # Joints that pull on each other are not where they should be after so few sweeps.
-        found = pgs.solve(iterations, 1, *lax.stop_gradient((tuple(rows), zero, start, zero)))[1]
+        found = pgs.from_rest(iterations, tuple(rows), zero)
         correction = add_impulses(tuple(rows), zero, pgs.as_swept(iterations, tuple(rows), zero, found))
     return displace(moved, inertia, correction if back is None else correction + back)
 
@@ -338,8 +338,7 @@ def _leave_contacts(scene: Scene, problem: Problem, reduced: mechanism_contacts.
     percent, iterations = scene.options.position_percent, scene.options.position_iterations
     contacts = [contact.position_rows(group, displacement, percent) for group in problem.contact_rows]
     rows, still, chosen = mechanism_contacts.normal_rows(reduced, contacts)
-    start = tuple(jnp.zeros_like(group.bias) for group in rows)
-    found = pgs.solve(iterations, 1, *lax.stop_gradient((rows, still, start, still)))[1]
+    found = pgs.from_rest(iterations, rows, still)
 
     def change(impulses: tuple[Array, ...]) -> Array:
         of_chosen = mechanism_contacts.in_order(impulses)

@@ -111,19 +111,17 @@ def solve(links: Links, wanted: Impulses, known: Solution | None = None) -> Solu
     return _as_found(links, wanted, None, known)
 
 
-def _as_found(links: Links, wanted: Impulses, against: tree.Pair | None, found: Solution) -> Solution:
-    """What was found, with the derivative of the solution; arguments as of `_solution`."""
+def _as_found(links: Links, wanted: Impulses | None, against: tree.Pair | None, found: Solution) -> Solution:
+    """What was found, with the derivative of the solution; arguments as of `_solution`, None for 0."""
     leaves, structure = jax.tree.flatten((links, wanted, against, lax.stop_gradient(found)))
     return jax.tree.unflatten(jax.tree.structure(found), _solution_p.bind(*leaves, structure=structure))
 
 
 def _linear_solve(links: Links, right: Solution) -> Solution:
     """Solution x of ``_product(links, x) = right``; differentiable in both modes."""
-
-    def found(_: Any, right: Solution) -> Solution:
-        return _solution(links, *right)
-
-    return lax.custom_linear_solve(lambda x: _product(links, x), right, found, symmetric=True)
+    return lax.custom_linear_solve(
+        lambda x: _product(links, x), right, lambda _, right: _solution(links, *right), symmetric=True
+    )
 
 
 def _product(links: Links, solution: Solution) -> Solution:
@@ -160,10 +158,11 @@ def _solution_jvp(
     found = jax.tree.unflatten(jax.tree.structure(known), leaves)
     changes = jax.jvp(lambda links: _product(links, found), (links,), (d_links,))[1]
     rates, momentum = jax.tree.map(jnp.negative, changes)
-    rates = only_held(links, jax.tree.map(jnp.add, d_wanted, rates))
+    if d_wanted is not None:
+        rates = jax.tree.map(jnp.add, d_wanted, rates)
     if d_against is not None:
         momentum = jax.tree.map(jnp.add, d_against, momentum)
-    return list(leaves), jax.tree.leaves(_linear_solve(links, Solution(rates, momentum)))
+    return list(leaves), jax.tree.leaves(_linear_solve(links, Solution(only_held(links, rates), momentum)))
 
 
 # A primitive: a `custom_jvp` loses its rule where JAX splits a program into what is known and what is linear, and with it
@@ -183,20 +182,19 @@ def _solution(links: Links, wanted: Impulses, against: tree.Pair | None = None) 
     found = _of_trees(links, wanted[:6], against)
     if links.loops is None:
         return found
-    loops = lax.stop_gradient(links.loops)
-    left = wanted[6] - mechanism_loops.rates(loops, *unpack(found.motion))
-    closing = mechanism_loops.impulses(loops, compute_once(left, left))
+    left = wanted[6] - mechanism_loops.rates(links.loops, *unpack(found.motion))
+    closing = mechanism_loops.impulses(links.loops, compute_once(left, left))
     impulses, motion = _of_trees(links, wanted[:6], _against_closing(links, closing, against))
     return Solution((*impulses, closing), motion)
 
 
 def _of_trees(links: Links, wanted: Impulses, against: tree.Pair | None) -> Solution:
     """The same where nothing closes loops."""
-    translations, duals = lax.stop_gradient((links.translations, links.duals))
+    duals = links.duals
     # Each goes into all components of a motion.
     wanted = compute_once(wanted, wanted[0])
     turn = compute_once(along_directions(duals[1], wanted[3:]), wanted[0])
-    shift = along_directions(duals[0], wanted[:3]) + shift_of_turn(translations, duals[0], turn)
+    shift = along_directions(duals[0], wanted[:3]) + shift_of_turn(links.translations, duals[0], turn)
     shift = compute_once(shift, wanted[0])
     force, motion = tree.force_for(links.layout.tree, links.factors, pack(shift, turn), against)
     return Solution(*compute_once((_of_rows(links, force), motion), wanted[0]))
@@ -226,10 +224,7 @@ def respond(links: Links, impulse: Array) -> Array:
     of_links = take(unpack_blocks(impulse), links.layout.blocks)
     worlds = max(impulse.shape[-1], links.factors.offset.shape[-1])
     against = in_every_world(pack(*(-part for part in of_links)), worlds)
-    nothing = (jnp.zeros((len(links.layout.links), worlds), impulse.dtype),) * 6
-    if links.loops is not None:
-        nothing = (*nothing, jnp.zeros((links.loops.compliance.shape[0], worlds), impulse.dtype))
-    return _as_found(links, nothing, against, _response(*lax.stop_gradient((links, against)))).change(links)
+    return _as_found(links, None, against, _response(*lax.stop_gradient((links, against)))).change(links)
 
 
 def _response(links: Links, against: tree.Pair) -> Solution:

@@ -5,7 +5,6 @@ Joints that close loops are added to the tree of the others (`mechanism_loops`).
 
 from __future__ import annotations
 
-import operator
 from typing import Any
 
 import jax
@@ -223,7 +222,8 @@ def forces_on_links(links: Links, impulses: Impulses) -> tuple[Vec3, Vec3]:
     force, torque = force - to_parents(links.layout, force), torque - to_parents(links.layout, carried)
     if links.loops is None:
         return force, torque
-    return tuple(map(operator.add, (force, torque), mechanism_loops.forces(links.loops, impulses[6])))  # type: ignore[return-value]
+    closing_force, closing_torque = mechanism_loops.forces(links.loops, impulses[6])
+    return force + closing_force, torque + closing_torque
 
 
 def along_directions(directions: tuple[Vec3, ...], values: Impulses) -> Vec3:

@@ -17,7 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
 from mathota_jax.solver import conjugate, implicit, linear_sweeps, sweeps
@@ -108,17 +108,22 @@ def _of_number(iterations: int, dtype: Any) -> Callable[[Array | int], Update]:
     return of_number
 
 
+def from_rest(iterations: int, rows: tuple[Rows, ...], still: Array) -> tuple[Array, ...]:
+    """Impulses after sweeps from nothing, without derivative; `still` is the velocity (component, block, world), 0."""
+    start = tuple(jnp.zeros_like(group.bias) for group in rows)
+    return solve(iterations, 1, *lax.stop_gradient((rows, still, start, still)))[1]
+
+
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def as_swept(iterations: int, rows: tuple[Rows, ...], still: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
-    """Impulses that sweeps from nothing have `found`, with the derivative of just these sweeps.
+    """Impulses that `from_rest` found, with the derivative of just these sweeps.
 
     Of few sweeps, which end before the solution: their derivative is not that of the solution. Reverse mode stores the
     impulses of each.
 
     Args:
       iterations: number of sweeps.
-      rows: as of `solve`.
-      still: the velocity (component, block, world) from which they were found, 0.
+      rows, still: as of `from_rest`.
       found: for each group (turn, row, column, world), without derivative.
     """
     del iterations, rows, still
