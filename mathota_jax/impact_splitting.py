@@ -12,13 +12,13 @@ from jax import Array, lax
 from mathota_jax.bodies import Bodies, merge, moving, moving_inertia, unpack
 from mathota_jax.constraints import collisions, contact, joint_layout
 from mathota_jax.constraints.lever import levers
-from mathota_jax.constraints.problem import constrain, starting_impulses
+from mathota_jax.constraints.problem import constrain, last_impulses, starting_impulses
 from mathota_jax.dynamics.flight import Flight, flight, with_static
 from mathota_jax.dynamics.impact_times import FirstImpact, first_impact
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.model import Model
 from mathota_jax.outcome import forces, new_state
-from mathota_jax.phases import correct_positions, external, free_velocities, gravity, solve_rows
+from mathota_jax.phases import correct_positions, external, free_velocities, gravity, let_rest, solve_rows
 from mathota_jax.scene import Scene
 from mathota_jax.spatial.indexing import in_every_world, take
 from mathota_jax.spatial.quaternion import Quaternion, multiply
@@ -93,7 +93,9 @@ def _until_impact(whole: Model, progress: _Progress, action: Array, last: Array)
     counting = [collisions.corrected(*one, split) for one in zip(problem.contact_rows, foreseen, strict=True)]
     problem = problem._replace(contact_rows=[group for group, _ in counting])
     dropped = [none for _, none in counting]
-    start, _ = starting_impulses(model, state, problem, inertia, packed)
+    carried = last_impulses(model, state, problem)
+    problem = let_rest(model, problem, carried, whole.dt)
+    start, _ = starting_impulses(model, state, problem, carried, inertia, packed)
     joint_count = len(problem.joint_rows)
     start = start[:joint_count] + tuple(
         jnp.where(none, 0.0, impulse) for impulse, none in zip(start[joint_count:], dropped, strict=True)

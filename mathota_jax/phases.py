@@ -37,6 +37,7 @@ from mathota_jax.constraints import (
     motor,
     rebound_limit,
 )
+from mathota_jax.constraints.carried import resting
 from mathota_jax.constraints.mechanism_layout import (
     bounded_slots,
     covers,
@@ -55,7 +56,7 @@ from mathota_jax.solver.rows import Rows, add_impulses
 from mathota_jax.spatial.indexing import in_every_world, put, take
 from mathota_jax.spatial.safe import safe_divide, safe_sqrt
 from mathota_jax.spatial.settle import compute_once, settle, store_cotangents
-from mathota_jax.spatial.vector import Vec3, dot, where
+from mathota_jax.spatial.vector import Vec3, dot, norm, where
 from mathota_jax.state import State
 
 
@@ -96,6 +97,12 @@ def free_velocities(
 def gravity(model: Model) -> Vec3:
     """Components (1, world) [m/s^2]."""
     return Vec3(*(model.gravity[axis][None] for axis in range(3)))
+
+
+def let_rest(model: Model, problem: Problem, last: tuple[Array, ...], step: Array) -> Problem:
+    """The problem without rebounds of contacts that carry a load, told by impulses of the last step, which took `step`."""
+    fall = norm(gravity(model)) * step
+    return problem.with_contacts(resting(problem.contact_rows, last[len(problem.joint_rows) :], fall))
 
 
 class SolvedRows(NamedTuple):

@@ -12,11 +12,10 @@ from jax import Array
 from mathota_jax.batching import Shortcut, batch_last
 from mathota_jax.bodies import moving, moving_inertia, unpack
 from mathota_jax.constraints import contact
-from mathota_jax.constraints.carried import resting
 from mathota_jax.constraints.lever import levers
 from mathota_jax.constraints.mechanism import Solutions
 from mathota_jax.constraints.mechanism_layout import layout, takes_small_steps
-from mathota_jax.constraints.problem import Forces, constrain, known_impulses, starting_impulses
+from mathota_jax.constraints.problem import Forces, constrain, known_impulses, last_impulses, starting_impulses
 from mathota_jax.dynamics import sleep
 from mathota_jax.dynamics.integrate import advance
 from mathota_jax.impact_splitting import split_at_impacts
@@ -31,6 +30,7 @@ from mathota_jax.phases import (
     external,
     free_velocities,
     gravity,
+    let_rest,
     let_sleep,
     small_steps,
     solve_rows,
@@ -38,7 +38,6 @@ from mathota_jax.phases import (
 )
 from mathota_jax.spatial.indexing import in_every_world
 from mathota_jax.spatial.settle import compute_once, materialize
-from mathota_jax.spatial.vector import norm
 from mathota_jax.state import Flag, State
 
 
@@ -182,20 +181,19 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     free, decay = compute_once(free_velocities(model, blocks, acting, halfway, force, torque), state.position)
     problem = constrain(model, bodies, blocks, acting, free, halfway, gravity(model), action)
     packed = contact.pack_motion(scene, *free)
-    if scene.restitution and scene.options.solver == "converged" and problem.contact_rows:
-        last, _ = starting_impulses(model, state, problem, acting, packed)
-        last = last[len(problem.joint_rows) :]
-        problem = problem.with_contacts(resting(problem.contact_rows, last, norm(gravity(model)) * model.dt, model.dt))
+    last = last_impulses(model, state, problem)
+    small = takes_small_steps(scene)
+    if scene.restitution and problem.contact_rows and not small:
+        problem = let_rest(model, problem, last, model.dt)
     if uncut is not None:
         start, change = uncut, None
     elif known is not None:
         start, change = known_impulses(model, problem, known), None
     else:
-        start, change = starting_impulses(model, state, problem, acting, packed)
-    lever, beyond, gained, failed, last = None, None, None, None, None
-    small = takes_small_steps(scene)
+        start, change = starting_impulses(model, state, problem, last, acting, packed)
+    lever, beyond, gained, failed, ended_with = None, None, None, None, None
     if small:
-        solved, gained, impulses, last = small_steps(model, problem, blocks, packed, start)
+        solved, gained, impulses, ended_with = small_steps(model, problem, blocks, packed, start)
     else:
         is_solved = known is not None or uncut is not None
         solved, impulses, failed, held, uncut = solve_rows(
@@ -219,9 +217,9 @@ def _simulate(model: Model, state: State, action: Array, solved_before: Solved |
     if closing is not None:
         found["joint_force"] = found["joint_force"] + closing
     new = new_state(scene, state, moved, found, failed)
-    if last is not None:
+    if ended_with is not None:
         assert state.end_forces is not None
-        ends = end_forces(model, problem, state.end_forces, last)
+        ends = end_forces(model, problem, state.end_forces, ended_with)
         if closing is not None:
             ends = dataclasses.replace(ends, joint_force=ends.joint_force + closing)
         new = dataclasses.replace(new, end_forces=ends)

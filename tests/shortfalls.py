@@ -6,10 +6,6 @@ A test that starts to pass fails the suite (strict xfail), so that its entry is 
 from __future__ import annotations
 
 SHORTFALLS: dict[str, str] = {
-    "tests/physics/test_hard_scenes.py::test_gates[A4 elastic block of 216 balls, dt 0.0010-pgs]": "no energy is gained "
-    "(1e-7), but 1.8 % is lost in 10 s: mean squared error 3.4e5 J^2, gate 10 (RaiSim 8.4, ODE 112, Bullet 4e4, DART "
-    "3.5e5). Several impacts on a ball in one step, of which only the first is exact; close pairs do not split steps. Where "
-    "rebounds would gain energy all of that step are cut, which is 0.2 % of it",
     **{
         f"tests/stability/test_bad_worlds.py::test_time_steps_out_of_all_proportion[{scene}-{precision}]": f"two boxes "
         f"{what}, at rest to a micrometre, gain {gain} times the energy of a lift, gate 0.01; none in steps up to 1 s, "

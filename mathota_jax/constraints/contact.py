@@ -37,7 +37,7 @@ from mathota_jax.constraints.effective_mass import (
     step_length,
     tangent_bound,
 )
-from mathota_jax.constraints.impact import Approach, impact, loaded, rebound
+from mathota_jax.constraints.impact import Approach, impact, let_in, loaded, rebound, stop
 from mathota_jax.constraints.mechanism_layout import contact_places
 from mathota_jax.constraints.unreached import Turns, lone_spheres, unreached
 from mathota_jax.model import Model
@@ -78,10 +78,13 @@ class Load(NamedTuple):
     Attributes:
       alone: impulse that the rebound takes if nothing else is carried; 0 for no rebound.
       lever: time [s] that the impulse has to act if most of it carries others.
+      bias, resting: of the rows and their lever without rebound.
     """
 
     alone: Array
     lever: Array
+    bias: Array
+    resting: Array
 
 
 class ContactRows(NamedTuple):
@@ -93,7 +96,7 @@ class ContactRows(NamedTuple):
       directions: row directions in the world frame, components (turn * column, world); none where the matrix of the rows
         keeps them, with the sign of the only side that moves.
       separation: (turn, 1, column, world) at the start of the step.
-      slop: (turn, 1, column, world) penetration left alone.
+      slop: (turn, 1, column, world) penetration left alone, for good or till the next step.
       size: (turn, 1, column, world) inner radius of the smaller moving body.
       falling: (turn, row, column, world) change of each row's velocity by gravity during the lever; None where no rebounds
         need a limit.
@@ -193,10 +196,13 @@ def contact_rows(
     chosen = chosen._replace(separation=chosen.separation + further)
     restitution = pair_restitution(scene, table, model, pairs) if scene.restitution else None
     approach = Approach(chosen.separation, start, free, restitution, motion.gravity)
+    admitted, stopped = None, None
     if scene.options.solver == "soft_step":
         target, lever = rebound(approach, model.dt, model.dt * (1.0 + 1.0 / scene.options.substep_count))
     else:
-        target, lever = impact(approach, model.dt)
+        admitted = let_in(approach, jnp.minimum(*_of_bodies(scene, table, pairs, model.size)), model.dt)
+        stopped = stop(approach, admitted, model.dt)
+        target, lever = impact(approach, stopped, model.dt)
     active = compute_once(pack_scalars(table, [chosen.active.astype(normal.x.dtype)], worlds)[:, 0], normal.x)
     # Empty columns of a table have no response.
     entries = step_length(scene, matrix).entries()
@@ -218,8 +224,8 @@ def contact_rows(
         )
         if scene.options.solver == "pgs" and couples_rotation(scene):
             slip = lax.stop_gradient(matrix_velocity(table, matrix.other_rows(), places, motion.free_velocity))
-            stopped = pack_scalars(table, [jnp.maximum(target - free, 0.0)], worlds)[:, 0]
-            factor = sliding_step(entries, table.together, meets, law, lax.stop_gradient(stopped), slip)
+            halted = pack_scalars(table, [jnp.maximum(target - free, 0.0)], worlds)[:, 0]
+            factor = sliding_step(entries, table.together, meets, law, lax.stop_gradient(halted), slip)
             law = dataclasses.replace(law, normal_mass=law.normal_mass * factor)
         bias += [jnp.zeros(()), jnp.zeros(())]
     else:
@@ -233,9 +239,10 @@ def contact_rows(
     )
     separation = jnp.where(chosen.active, chosen.separation, 0.0)
     falling, load = None, None
-    if scene.restitution and scene.options.solver != "soft_step":
-        asked, lasting = (pack_scalars(table, [x], worlds) for x in loaded(approach, target, lever, model.dt))
-        load = Load(asked * _rebounding_mass(table, rows, motion, worlds), lasting)
+    if scene.restitution and stopped is not None:
+        of_load = (*loaded(approach, target, lever, model.dt), -stopped.target, stopped.lever)
+        asked, lasting, still, resting = (pack_scalars(table, [x], worlds) for x in of_load)
+        load = Load(asked * _rebounding_mass(table, rows, motion, worlds), lasting, still, resting)
     if scene.rebounds_may_gain:
         side = sum(_signs(scene, table, pairs))  # 0 for two moving bodies, which fall together
         falling = pack_scalars(table, [side * dot(along, motion.gravity) * lever for along in directions], worlds)
@@ -247,7 +254,7 @@ def contact_rows(
         pack_scalars(table, [lever], worlds),
         directions,
         pack_scalars(table, [separation], worlds),
-        slop,
+        slop if admitted is None else slop + pack_scalars(table, [admitted], worlds),
         size,
         falling,
         load=load,

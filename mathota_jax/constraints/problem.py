@@ -228,27 +228,33 @@ def _contacts(
     return _Contacts(contacts, rows, close, contact_offsets(model, bodies, contacts, close), with_joints)
 
 
-def starting_impulses(
-    model: Model, state: State, problem: Problem, inertia: Inertia, velocity: Array
-) -> tuple[tuple[Array, ...], Array | None]:
-    """Impulses to start from: those of the last step where rows and features are the same (guide 12.4).
-
-    Also what they do to the velocities (component, block, world), where that is known.
-    """
+def last_impulses(model: Model, state: State, problem: Problem) -> tuple[Array, ...]:
+    """Impulses of the last step where rows and features are the same (guide 12.4); those of a small step."""
     if not model.scene.options.warm_start:
-        return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows), jnp.zeros_like(velocity)
+        return tuple(jnp.zeros_like(rows.bias) for rows in problem.rows)
     last = state if state.end_forces is None else state.end_forces
     force = None
     if problem.contacts is not None:
         force = matched_force(model.scene, problem.contacts, problem.offsets, problem.close, state, last.contact_force)
-    start = _impulses(model, problem, last.joint_force, force)
+    return _impulses(model, problem, last.joint_force, force)
+
+
+def starting_impulses(
+    model: Model, state: State, problem: Problem, last: tuple[Array, ...], inertia: Inertia, velocity: Array
+) -> tuple[tuple[Array, ...], Array | None]:
+    """Impulses to start from, of those of the last step.
+
+    Also what they do to the velocities (component, block, world), where that is known.
+    """
+    if not model.scene.options.warm_start:
+        return last, jnp.zeros_like(velocity)
     if state.end_forces is not None:
         longer = substep_rows.substep_length(model) / state.end_forces.time
         share = lax.stop_gradient(jnp.minimum(LARGEST_GROWTH / longer, 1.0))
-        return tuple(impulse * share for impulse in start), None
+        return tuple(impulse * share for impulse in last), None
     if problem.contacts is None:
-        return start, None
-    return warm_start.plausible(problem.rows, inertia, velocity, start)
+        return last, None
+    return warm_start.plausible(problem.rows, inertia, velocity, last)
 
 
 def known_impulses(model: Model, problem: Problem, solved: Forces) -> tuple[Array, ...]:

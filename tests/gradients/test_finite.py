@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mathota_jax import Box, Capsule, Hinge, Plane, SceneBuilder, Slider, Sphere, contacts, energy, rollout, step
-from mathota_jax.constraints.impact import Approach, impact
+from mathota_jax.constraints.impact import Approach, stop
 from mathota_jax.spatial.vector import Vec3
 from tests.scenes import DOWN, stack, undamped
 
@@ -124,7 +124,7 @@ def test_a_wide_gap_that_hardly_closes(speed):
     def lever(start):
         one = jnp.ones(1)
         gravity = Vec3(0.0 * one, -9.81 * one, 0.0 * one)
-        return impact(Approach(20.0 * one, -start * one, -start * one, None, gravity), jnp.asarray(0.01))
+        return stop(Approach(20.0 * one, -start * one, -start * one, None, gravity), None, jnp.asarray(0.01))
 
     assert np.isfinite(np.asarray(jax.jacrev(lambda start: jnp.stack(lever(start)))(speed))).all()
 
