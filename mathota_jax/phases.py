@@ -267,7 +267,12 @@ def _sweep(
     gradient = _gradient_iterations(scene, rows, iterations)
     conjugate = scene.options.conjugate and not scene.restitution and inertia is not None
     masses = lax.stop_gradient(jax.tree_util.Partial(momentum, inertia)) if conjugate else None
-    return *pgs.solve(sweeps, gradient, rows, velocity, start, change, masses), None
+    return *pgs.solve(sweeps, gradient, _on_facets(scene), rows, velocity, start, change, masses), None
+
+
+def _on_facets(scene: Scene) -> bool:
+    """Whether contacts of one body may have normals that differ by a small angle."""
+    return any("heightfield" in (group.kind_a, group.kind_b) for group in (*scene.pair_groups, *scene.compact_groups))
 
 
 def _gradient_iterations(scene: Scene, rows: tuple[Rows, ...], iterations: int) -> int:
@@ -332,7 +337,7 @@ def correct_positions(
         correction = converged.solve(tuple(rows), zero, start)[0]
     elif problem.joints is None:
         gradient = _gradient_iterations(scene, tuple(rows), iterations)
-        correction, _ = pgs.solve(iterations, gradient, tuple(rows), zero, start, zero)
+        correction, _ = pgs.solve(iterations, gradient, _on_facets(scene), tuple(rows), zero, start, zero)
     else:
         # Joints that pull on each other are not where they should be after so few sweeps.
         found = pgs.from_rest(iterations, tuple(rows), zero)

@@ -297,7 +297,7 @@ def _rounds(
             )
             if solves_together(scene):
                 return converged.solve(biased, velocity, start)[1:]
-            return pgs.solve(iterations, gradient, biased, velocity, start, jnp.zeros_like(velocity))[1], None
+            return pgs.solve(iterations, gradient, False, biased, velocity, start, jnp.zeros_like(velocity))[1], None
 
         if scene.friction:
             both, failed = lax.map(with_restitution, jnp.array([0.0, 1.0], velocity.dtype))

@@ -67,7 +67,7 @@ def _sweep(
 ) -> tuple[Array, ...]:
     """Impulses of groups, from `rates` (row, world) without any."""
     started, state = with_rates(rows, delassus, rates)
-    return pgs.solve(scene.options.velocity_iterations, 1, started, state, start)[1]
+    return pgs.solve(scene.options.velocity_iterations, 1, False, started, state, start)[1]
 
 
 class _Drives(NamedTuple):

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from mathota_jax.solver import conjugate, implicit, linear_sweeps, sweeps
+from mathota_jax.solver import conjugate, implicit, linear_sweeps, newton, sweeps
 from mathota_jax.solver.laws import Cone, Push
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import (
@@ -43,10 +43,11 @@ OVER_RELAXATION = 1.7
 2. Measured with 10 sweeps from nothing: ten boxes dip by 1.0 mm instead of 2.3."""
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def solve(
     iterations: int,
     gradient_iterations: int,
+    to_solution: bool,
     rows: tuple[Rows, ...],
     velocity: Array,
     impulses: tuple[Array, ...],
@@ -58,6 +59,7 @@ def solve(
     Args:
       iterations: number of sweeps, 0 if the impulses are known to be solved.
       gradient_iterations: number of sweeps of the linear solver behind a derivative; 0 for a dense system instead.
+      to_solution: whether that system is the one at impulses nearer to the solution, see `newton`.
       rows: groups of rows, solved in this order within a sweep.
       velocity: (component, block, world) without any constraint impulse.
       impulses: for each group (turn, row, column, world), the impulses to start from.
@@ -111,7 +113,7 @@ def _of_number(iterations: int, dtype: Any) -> Callable[[Array | int], Update]:
 def from_rest(iterations: int, rows: tuple[Rows, ...], still: Array) -> tuple[Array, ...]:
     """Impulses after sweeps from nothing, without derivative; `still` is the velocity (component, block, world), 0."""
     start = tuple(jnp.zeros_like(group.bias) for group in rows)
-    return solve(iterations, 1, *lax.stop_gradient((rows, still, start, still)))[1]
+    return solve(iterations, 1, False, *lax.stop_gradient((rows, still, start, still)))[1]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -165,20 +167,23 @@ def _couple(rows: tuple[Rows, ...]) -> bool:
 
 
 @solve.defjvp
-def _solve_jvp(iterations: int, gradient_iterations: int, primals: tuple, tangents: tuple) -> tuple:
+def _solve_jvp(iterations: int, gradient_iterations: int, to_solution: bool, primals: tuple, tangents: tuple) -> tuple:
     rows, velocity, impulses, change, momentum = primals
     d_rows, d_velocity, _, _, _ = tangents
-    velocity, impulses = solve(iterations, gradient_iterations, rows, velocity, impulses, change, momentum)
+    found = solve(iterations, gradient_iterations, to_solution, rows, velocity, impulses, change, momentum)
     if not rows:
-        return (velocity, impulses), (d_velocity, impulses)
-    d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
+        return found, (d_velocity, impulses)
     # With all entries: the transposed system exchanges Jacobian and response.
     dense = tuple(dataclasses.replace(group, matrix=_all_entries(group)) for group in rows)
+    velocity, impulses = found
+    if to_solution and not gradient_iterations:
+        velocity, impulses = newton.nearer(dense, velocity, impulses)
+    d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     if gradient_iterations:
         d_impulses = linear_sweeps.solve(gradient_iterations, dense, slopes, right_sides)
     else:
         d_impulses = implicit.solve(dense, slopes, right_sides)
-    return (velocity, impulses), (with_changes(rows, (velocity, impulses), (d_velocity, d_impulses)), d_impulses)
+    return found, (with_changes(rows, (velocity, impulses), (d_velocity, d_impulses)), d_impulses)
 
 
 def _all_entries(group: Rows) -> Any:

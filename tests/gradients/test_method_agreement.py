@@ -31,7 +31,7 @@ def test_unrolled_sweeps_have_the_implicit_derivative(float64, friction, gate):
         return run
 
     def implicit(velocity):
-        return pgs.solve(4000, 4000, rows, velocity, start)[0]
+        return pgs.solve(4000, 4000, False, rows, velocity, start)[0]
 
     (_, truth), (_, few), (_, many) = (
         jax.jit(lambda v, f=f: jax.jvp(f, (v,), (direction,)))(packed) for f in (implicit, unrolled(10), unrolled(4000))

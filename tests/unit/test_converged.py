@@ -232,7 +232,7 @@ def test_derivative_agrees_with_that_of_the_sweeps(float64, friction, gate):
     direction = jnp.asarray(np.random.default_rng(0).normal(size=packed.shape))
 
     def by_sweeps(velocity):
-        return pgs.solve(20000, 20000, rows, velocity, start)[0]
+        return pgs.solve(20000, 20000, False, rows, velocity, start)[0]
 
     def directly(velocity):
         return converged.solve(rows, velocity, start)[0]
