@@ -100,7 +100,11 @@ def check_actions(label: str, model: Model, state: State, actions: Array | int) 
             f"{label}: the number of steps must be known at compilation: jax.jit({label}, static_argnums=2), or a Python "
             "integer inside of your own jitted function"
         )
-    actions = jnp.asarray(actions, state.position.dtype)
+    try:
+        actions = jnp.asarray(actions, state.position.dtype)
+    except (TypeError, ValueError) as error:
+        wanted = f"an array of shape (steps, {motor_count}) or a whole number of steps"
+        raise ValueError(f"{label}: actions must be {wanted}, got a {type(actions).__name__}") from error
     if actions.ndim != 2 or actions.shape[1] != motor_count:
         raise ValueError(f"{label}: actions must have shape (steps, {motor_count}), got {actions.shape}")
     return actions

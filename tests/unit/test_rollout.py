@@ -46,6 +46,10 @@ def test_what_does_not_fit_is_named(run):
         run(model, state, -1)
     with pytest.raises(ValueError, match=rf"{name}: actions must have shape \(steps, 0\), got \(5, 1\)"):
         run(model, state, jnp.zeros((5, 1)))
+    wanted = r"actions must be an array of shape \(steps, 0\) or a whole number of steps"
+    for given in (None, {}, "five"):
+        with pytest.raises(ValueError, match=rf"{name}: {wanted}, got a {type(given).__name__}"):
+            run(model, state, given)
     with pytest.raises(
         ValueError, match=rf"{name}: the number of steps must be known at compilation: jax\.jit\({name}"
     ):
