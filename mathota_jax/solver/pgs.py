@@ -177,7 +177,9 @@ def _solve_jvp(iterations: int, gradient_iterations: int, to_solution: bool, pri
     dense = tuple(dataclasses.replace(group, matrix=_all_entries(group)) for group in rows)
     velocity, impulses = found
     if to_solution and not gradient_iterations:
-        velocity, impulses = newton.nearer(dense, velocity, impulses)
+        # Second derivatives are those of what was found.
+        nearer = jax.tree.map(jnp.subtract, newton.nearer(dense, velocity, impulses), found)
+        velocity, impulses = jax.tree.map(jnp.add, found, lax.stop_gradient(nearer))
     d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     if gradient_iterations:
         d_impulses = linear_sweeps.solve(gradient_iterations, dense, slopes, right_sides)
