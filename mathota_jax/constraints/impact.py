@@ -53,8 +53,8 @@ def let_in(approach: Approach, size: Array, dt: Array) -> Array | None:
     """
     if approach.restitution is None:
         return None
-    wide = approach.separation > FALL * norm(approach.gravity) * dt * dt
-    return settle(jnp.where(wide, 1.0, 0.0)) * LET_IN * size * approach.restitution
+    wide = (approach.separation > FALL * norm(approach.gravity) * dt * dt) & (approach.restitution > 0)
+    return jnp.where(settle(jnp.where(wide, 1.0, 0.0)) > 0, LET_IN * size * approach.restitution, 0.0)
 
 
 class Answer(NamedTuple):
