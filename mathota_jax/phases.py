@@ -271,7 +271,13 @@ def _sweep(
 
 
 def _on_facets(scene: Scene) -> bool:
-    """Whether contacts of one body may have normals that differ by a small angle."""
+    """Whether contacts of one body may have normals that differ by a small angle: derivatives need the solution then.
+
+    Such contacts exchange their impulses at a rate of the square of that angle a sweep. While both still press though only
+    one would in the end, the derivative at the impulses found is that of a body wedged between the two: a ball that rolls
+    over bumps of 4 % of a cell had derivatives of 48 by its own velocity (0.3 in truth) in one step of fifteen, and after
+    twenty steps 1000 times the truth.
+    """
     return any("heightfield" in (group.kind_a, group.kind_b) for group in (*scene.pair_groups, *scene.compact_groups))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
 from mathota_jax.collision.manifold import ContactPoint, Manifold
 from mathota_jax.spatial.settle import settle, store_cotangents
@@ -66,26 +66,41 @@ def round_point(
 
 
 def closest_parameters(
-    offset: Vec3, axis_a: Vec3, axis_b: Vec3, half_length_a: Any, half_length_b: Any
+    offset: Vec3, axis_a: Vec3, axis_b: Vec3, half_length_a: Any, half_length_b: Any, level: bool = False
 ) -> tuple[Array, Array]:
     """Parameters of the closest points of two segments with unit axes; `offset` leads from A's centre to B's.
 
     Source: C. Ericson, "Real-Time Collision Detection" (2005), section 5.1.9. The determinant is taken from the
-    rejected component rather than as ``1 - cos^2``, which cancels; parallel axes start from the overlap's middle.
+    rejected component rather than as ``1 - cos^2``, which cancels, and the way to the closest points from the middle of the
+    overlap, where those of parallel axes are.
+
+    Args:
+      offset, axis_a, axis_b: the axes.
+      half_length_a, half_length_b: of the segments.
+      level: whether axes count as parallel that are so to half of the digits. They come closer towards one end by their
+        angle times the way to it, in float32 by 1e-3 of a length, but the direction between the closest points turns
+        sideways by their pitch over that angle.
     """
     cosine = store_cotangents(dot(axis_a, axis_b))
     along_a = store_cotangents(dot(axis_a, offset))
     along_b = store_cotangents(dot(axis_b, offset))
-    across = axis_b - axis_a * cosine
+    across = axis_a - axis_b * cosine
     sine_squared = store_cotangents(dot(across, across))
-    parallel = settle((sine_squared < 64.0 * jnp.finfo(sine_squared.dtype).eps).astype(sine_squared.dtype)) > 0.5
-    # The unconstrained minimum: offset + b * axis_b - a * axis_a is perpendicular to both axes.
-    line_a = (along_a - cosine * along_b) / jnp.where(parallel, 1.0, sine_squared)
-    # (Nearly) parallel: the middle of the overlap of B's shadow on A.
+    eps = jnp.finfo(sine_squared.dtype).eps
+    least = 64.0 * eps if level else (8.0 * eps) ** 2
+    parallel = settle((sine_squared < least).astype(sine_squared.dtype)) > 0.5
+    # The middle of the overlap of B's shadow on A.
     reach = half_length_b * jnp.abs(cosine)
     low = clamp(along_a - reach, -half_length_a, half_length_a)
     high = clamp(along_a + reach, -half_length_a, half_length_a)
-    a = jnp.where(parallel, 0.5 * (low + high), clamp(line_a, -half_length_a, half_length_a))
+    middle = 0.5 * (low + high)
+    # The unconstrained minimum: offset + b * axis_b - a * axis_a is perpendicular to both axes. It is the same from wherever
+    # one looks for it.
+    base = lax.stop_gradient(middle)
+    partner = lax.stop_gradient(clamp(cosine * base - along_b, -half_length_b, half_length_b))
+    between = offset + axis_b * partner - axis_a * base
+    line_a = base + dot(between, across) / jnp.where(parallel, 1.0, sine_squared)
+    a = jnp.where(parallel, middle, clamp(line_a, -half_length_a, half_length_a))
     b = clamp(cosine * a - along_b, -half_length_b, half_length_b)
     a = clamp(cosine * b + along_a, -half_length_a, half_length_a)
     return store_cotangents(a), store_cotangents(b)

@@ -31,7 +31,7 @@ from jax import Array, lax
 
 from mathota_jax.solver import implicit, velocity_system
 from mathota_jax.solver.laws import Cone, Push
-from mathota_jax.solver.pgs import linearise, with_changes
+from mathota_jax.solver.linearised import linearise, with_changes
 from mathota_jax.solver.proximal import masses, slope, stiffen
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import Rows, add_impulses, row_velocity

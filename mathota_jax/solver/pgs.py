@@ -20,17 +20,15 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.custom_derivatives import SymbolicZero
 
-from mathota_jax.solver import conjugate, implicit, linear_sweeps, newton, sweeps
+from mathota_jax.solver import conjugate, converged, implicit, linear_sweeps, sweeps
 from mathota_jax.solver.laws import Cone, Push
+from mathota_jax.solver.linearised import linearise, with_changes
 from mathota_jax.solver.row_matrix import Dense
 from mathota_jax.solver.rows import (
     Rows,
-    add_changes,
     add_impulses,
     map_turns,
-    row_velocity,
 )
-from mathota_jax.solver.slopes import Slopes, slopes_of
 from mathota_jax.solver.sweeps import Update
 from mathota_jax.spatial.settle import compute_once
 
@@ -59,7 +57,7 @@ def solve(
     Args:
       iterations: number of sweeps, 0 if the impulses are known to be solved.
       gradient_iterations: number of sweeps of the linear solver behind a derivative; 0 for a dense system instead.
-      to_solution: whether that system is the one at impulses nearer to the solution, see `newton`.
+      to_solution: whether that system is the one at what `converged` makes of the impulses.
       rows: groups of rows, solved in this order within a sweep.
       velocity: (component, block, world) without any constraint impulse.
       impulses: for each group (turn, row, column, world), the impulses to start from.
@@ -168,18 +166,19 @@ def _couple(rows: tuple[Rows, ...]) -> bool:
 
 @solve.defjvp
 def _solve_jvp(iterations: int, gradient_iterations: int, to_solution: bool, primals: tuple, tangents: tuple) -> tuple:
-    rows, velocity, impulses, change, momentum = primals
+    rows, free, start, _, _ = primals
     d_rows, d_velocity, _, _, _ = tangents
-    found = solve(iterations, gradient_iterations, to_solution, rows, velocity, impulses, change, momentum)
+    found = solve(iterations, gradient_iterations, to_solution, *primals)
     if not rows:
-        return found, (d_velocity, impulses)
+        return found, (d_velocity, start)
     # With all entries: the transposed system exchanges Jacobian and response.
     dense = tuple(dataclasses.replace(group, matrix=_all_entries(group)) for group in rows)
     velocity, impulses = found
     if to_solution and not gradient_iterations:
         # Second derivatives are those of what was found.
-        nearer = jax.tree.map(jnp.subtract, newton.nearer(dense, velocity, impulses), found)
-        velocity, impulses = jax.tree.map(jnp.add, found, lax.stop_gradient(nearer))
+        solution = converged.solve(*lax.stop_gradient((dense, free, impulses)))[:2]
+        further = jax.tree.map(jnp.subtract, solution, lax.stop_gradient(found))
+        velocity, impulses = jax.tree.map(jnp.add, found, further)
     d_velocity, slopes, right_sides = linearise(rows, d_rows, velocity, impulses, d_velocity)
     if gradient_iterations:
         d_impulses = linear_sweeps.solve(gradient_iterations, dense, slopes, right_sides)
@@ -192,47 +191,3 @@ def _all_entries(group: Rows) -> Any:
     if isinstance(group.matrix, Dense):
         return group.matrix
     return map_turns(lambda part, _: part.matrix.dense(), group, ())
-
-
-def linearise(
-    rows: tuple[Rows, ...], d_rows: tuple[Rows, ...], velocity: Array, impulses: tuple[Array, ...], d_velocity: Array
-) -> tuple[Array, tuple[Slopes, ...], tuple[Array, ...]]:
-    """Derivative of the fixed point of all laws, but for the change of the impulses.
-
-    Returns:
-      The change of the velocity at fixed impulses; for each group the slopes of its law, and the change of its impulses at
-      fixed impulses.
-    """
-    # As derivatives of what visits the turns in use alone, which can be transposed.
-    for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        added = functools.partial(_add_changes_by, group, impulse)
-        d_velocity = jax.jvp(added, (group.matrix, velocity), (d_group.matrix, d_velocity))[1]
-    slopes, right_sides = [], []
-    for group, d_group, impulse in zip(rows, d_rows, impulses, strict=True):
-        slopes.append(
-            map_turns(lambda part, impulse: slopes_of(part.law, impulse, _error(part, velocity)), group, impulse)
-        )
-        answer = functools.partial(_answer, group, impulse)
-        primals, changes = ((g.matrix, g.bias, g.law, v) for g, v in ((group, velocity), (d_group, d_velocity)))
-        right_sides.append(jax.jvp(answer, primals, changes)[1])
-    return d_velocity, tuple(slopes), tuple(right_sides)
-
-
-def with_changes(rows: tuple[Rows, ...], primals: tuple[Array, Any], changes: tuple[Array, Any]) -> Array:
-    """A change of the velocity with those of the impulses, by what they are changes of."""
-    return jax.jvp(functools.partial(add_impulses, rows), primals, changes)[1]
-
-
-def _add_changes_by(group: Rows, impulse: Array, matrix: Any, velocity: Array) -> Array:
-    return add_changes(group, matrix, velocity, impulse)
-
-
-def _error(part: Rows, velocity: Array) -> Array:
-    """Stored: it goes into all slopes of the law, and its cotangent into that of every entry of the matrix."""
-    return compute_once(part.bias + row_velocity(part, velocity), velocity)
-
-
-def _answer(group: Rows, impulse: Array, matrix: Any, bias: Array, law: Any, velocity: Array) -> Array:
-    """The impulses that the law makes of those given."""
-    group = dataclasses.replace(group, matrix=matrix, bias=bias, law=law)
-    return map_turns(lambda part, impulse: part.law.update(impulse, _error(part, velocity)), group, impulse)

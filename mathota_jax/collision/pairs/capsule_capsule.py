@@ -30,7 +30,7 @@ def capsule_capsule(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b: 
     radius_a, radius_b = a["radius"], b["radius"]
     offset = pose_b.position - pose_a.position
     axis_a, axis_b, offset = (v.map(store_cotangents) for v in (axis_a, axis_b, offset))
-    t_a, t_b = closest_parameters(offset, axis_a, axis_b, length_a, length_b)
+    t_a, t_b = closest_parameters(offset, axis_a, axis_b, length_a, length_b, level=True)
 
     across = cross(axis_a, axis_b).map(store_cotangents)
     fallback = direction(across, perpendicular(axis_a).map(store_cotangents), 1.0)
@@ -75,7 +75,7 @@ def capsule_distance(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b:
     assert pose_b.rotation is not None
     axis_a, axis_b = pose_a.rotation.column_y, pose_b.rotation.column_y
     offset = pose_b.position - pose_a.position
-    t_a, t_b = _exact_parameters(offset, axis_a, axis_b, a["half_height"], b["half_height"])
+    t_a, t_b = closest_parameters(offset, axis_a, axis_b, a["half_height"], b["half_height"])
     core_a, core_b = axis_a * t_a, axis_b * t_b
     across = cross(axis_a, axis_b)
     fallback = direction(across, perpendicular(axis_a), 1.0)
@@ -89,27 +89,6 @@ def capsule_distance(a: dict[str, Any], pose_a: Pose, b: dict[str, Any], pose_b:
         pose_a.position + core_a + normal * a["radius"],
         pose_b.position + core_b - normal * b["radius"],
     )
-
-
-def _exact_parameters(
-    offset: Vec3, axis_a: Vec3, axis_b: Vec3, half_length_a: Any, half_length_b: Any
-) -> tuple[Array, Array]:
-    """`closest_parameters`, which stay in the middle of axes that are parallel to half of the digits.
-
-    Axes in one plane come closer towards one end, by their angle times the way to it: in float32 by 1e-3 of a length.
-    """
-    t_a, t_b = closest_parameters(offset, axis_a, axis_b, half_length_a, half_length_b)
-    cosine = dot(axis_a, axis_b)
-    across = axis_a - axis_b * cosine
-    sine_squared, eps = dot(across, across), jnp.finfo(t_a.dtype).eps
-    turned = (sine_squared < 64.0 * eps) & (sine_squared > (8.0 * eps) ** 2)
-    turned = settle(jnp.where(turned, 1.0, 0.0).astype(t_a.dtype)) > 0.5
-    between = offset + axis_b * t_b - axis_a * t_a
-    way = dot(between, across) / jnp.where(turned, sine_squared, 1.0)
-    a = clamp(t_a + way, -half_length_a, half_length_a)
-    b = clamp(cosine * a - dot(axis_b, offset), -half_length_b, half_length_b)
-    a = clamp(cosine * b + dot(axis_a, offset), -half_length_a, half_length_a)
-    return jnp.where(turned, a, t_a), jnp.where(turned, b, t_b)
 
 
 def _normal(difference: Vec3, across: Vec3, fallback: Vec3, inner: Array, size: Any) -> Vec3:
